@@ -88,27 +88,24 @@ def departures(stage: PredictionStage, recording: Recording, ticks: Ints) -> Lim
     futures = [recorded_future(recording.t_ns, recording.points_m, states, h) for h in horizon_s.tolist()]
     bare = tube_stage(stage, _bare(horizon_s, 0.0, 0.0), residual=False)
     unknown_m = bare.settings.residual_unknown_m
-    at = [tubes(states, bare.limits, True, unknown_m, h, stage.memory_s) for h in horizon_s.tolist()]
-
-    # seen recently enough for the time of a departure
-    asked = [tubed.usable & (tubed.reach_s <= h) for tubed, h in zip(at, horizon_s, strict=True)]
+    tubed = tubes(states, True, unknown_m, stage.memory_s)
+    asked = tubed.usable & (tubed.late_s <= 0.0)  # seen recently enough for the time of a departure
 
     @cache
     def beyond_m(k: int, rise_m: float, sink_m: float) -> Floats:
         volumes = tube_stage(stage, _bare(horizon_s, rise_m, sink_m), residual=False).volumes(states, horizon_s[k])
         found = check_containment(volumes, futures[k], body_radii_m(stage), nothing).beyond_m
-        found = np.where(asked[k], found, np.nan)
-        found[~at[k].legs_shown, LEGS] = np.nan
+        found = np.where(asked, found, np.nan)
+        found[~tubed.legs_shown, LEGS] = np.nan
         return found
 
     heights = [_heights(bare.volumes(states, h), future) for h, future in zip(horizon_s, futures, strict=True)]
-    of_thorax = np.array([usable[:, THORAX] for usable in asked])
     return LimbDepartures(
         states,
         horizon_s,
-        np.where(of_thorax, np.stack(heights, axis=1), np.nan),
+        np.where(asked[:, THORAX], np.stack(heights, axis=1), np.nan),
         beyond_m,
-        at[0].residual,
+        tubed.residual,
         recording.source == TRUTH,
     )
 

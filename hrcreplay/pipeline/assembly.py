@@ -128,7 +128,12 @@ class PredictionStage:
         if method is not None:
             return self.by(method).volumes(states, horizon_s)
         horizon_s = self.horizon_s if horizon_s is None else horizon_s
-        return swept_volumes.predict(states, self.limits, self.settings, horizon_s=horizon_s, memory_s=self.memory_s)
+        return self.predictor.prepare(states).volumes(horizon_s)
+
+    @cached_property
+    def predictor(self) -> swept_volumes.Predictor:
+        """The stage's predictor, for volumes of the same people at several horizons."""
+        return swept_volumes.Predictor(self.limits, self.settings, self.memory_s)
 
 
 @dataclass(frozen=True)
@@ -185,18 +190,22 @@ class Forecast:
     states: HumanStates
 
     @cached_property
+    def person(self) -> swept_volumes.PreparedPerson:
+        """The person, prepared for volumes at any horizon."""
+        return self.around.prediction.predictor.prepare(self.states)
+
+    @cached_property
     def full(self) -> SweptVolumes:
         """Volumes of all ticks for the braking time T_s."""
-        return self.around.prediction.volumes(self.states)
+        return self.person.volumes(self.around.prediction.horizon_s)
 
     def obstacles(self, tick: int, horizon_s: float) -> Obstacles:
         """Obstacles of one tick up to ``horizon_s`` [s]."""
-        stage, states = self.around.prediction, self.states
-        if horizon_s == stage.horizon_s:
+        if horizon_s == self.around.prediction.horizon_s:
             person = obstacles(self.full, tick, horizon_s)
         else:
-            person = obstacles(stage.volumes(states.rows(slice(tick, tick + 1)), horizon_s), 0, horizon_s)
-        return self.around.obstacles(states, tick, person)
+            person = obstacles(self.person.volumes(horizon_s, tick, tick + 1), 0, horizon_s)
+        return self.around.obstacles(self.states, tick, person)
 
     def predict(self, tick: int) -> Predict:
         """Obstacles of one tick as a function of the horizon."""

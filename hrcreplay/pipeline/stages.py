@@ -448,7 +448,7 @@ def plan_batches(
                 with sink.watch.stage("hulls", len(stored)):
                     for tick in stored.tolist():
                         row = slice(tick, tick + 1)
-                        volumes = surroundings.prediction.volumes(batch.rows(row), float(motion.horizon_s[tick]))
+                        volumes = forecast.person.volumes(float(motion.horizon_s[tick]), tick, tick + 1)
                         store_volumes(volumes, np.zeros(1, np.int64), motion.horizon_s[row], sink.tables)
         done += len(batch)
         sink.progress("plan", len(batch))

@@ -28,11 +28,13 @@ legs are folded and the knees are further out.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from hrcreplay.geometry.convex_hull import CORNERS, DIRECTIONS, around, reach_turning
-from hrcreplay.geometry.hull_reduction import Surface, keep_corners, surface
-from hrcreplay.human.model import ARM_POINTS, HEAD, HEIGHT, NECK, ULA, URA, LimitSet, bounds_of, skeleton
+from hrcreplay.geometry.hull_reduction import Surface, keep_corners
+from hrcreplay.human.model import ARM_POINTS, HEAD, HEIGHT, NECK, ULA, URA, LimitSet, bounds_of, skeleton_row
 from hrcreplay.human.prediction.sound_reach import (
     SIDES,
     THIGH_M,
@@ -57,8 +59,10 @@ from hrcreplay.human.prediction.velocity_tube import (
     LEGS,
     MOST_POINTS,
     THORAX,
+    DepartureTable,
     Tubes,
     departs_m,
+    departure_table,
     tube,
     tubes,
     velocities,
@@ -83,131 +87,177 @@ MOST_CORNERS = 256
 _MANY_CORNERS = 40
 
 
-def sweep_sound(
-    states: HumanStates, limits: LimitSet, prediction: Prediction, limbs_m: Floats, span_s: float, memory_s: float
-) -> tuple[Floats, Ints, Floats]:
-    """Computes the swept volumes of all ticks and limbs.
+class SoundRules(NamedTuple):
+    """Settings and bounds of the volumes."""
+
+    bounds: Floats  #: (6, 13) of ``bounds_of``
+    coupled: bool  #: True: Eq. (34b), (34c) hold
+    departure: DepartureTable
+    bounded: bool  #: True: ``departure`` applies
+    limbs_m: Floats  #: (6,) radii of LIMBS, Table 2 [m]
+    body_m: Floats  #: (7,) radii of BODY in tubes [m]
+    hand_m: float  #: length of the hand beyond the wrist [m]
+    legs_m: float  #: radius of the lower body of standing people [m]
+    unknown_m: float  #: residual of a limb until it is known; NaN: residuals are not used [m]
+    memory_s: float  #: time for which the filter continues without a measurement [s]
+
+
+def sound_rules(limits: LimitSet, prediction: Prediction, limbs_m: Floats, memory_s: float) -> SoundRules:
+    """Collects the settings and bounds of the volumes.
 
     Args:
-        states: The fused person.
         limits: Bounds on the joints and, if given, on the limbs.
         prediction: Margins added to the model.
         limbs_m: (6,) radii of LIMBS, Table 2 [m].
-        span_s: Horizon and latency [s].
         memory_s: Time for which the filter continues without a measurement [s].
-
-    Returns:
-        Vertices (m, 3) [m] and the offsets of ``SweptVolumes``, and (n, limbs) radii [m].
     """
-    tubed = tubes(states, limits, prediction.residual, prediction.residual_unknown_m, span_s, memory_s)
-    radii = sound_radii(states, limbs_m, prediction)
-    vertices, offsets = _sweep_rows(
-        start_states(states, prediction, memory_s),
-        tubed,
-        np.ascontiguousarray(states.lengths_m),
-        np.ascontiguousarray(prediction.sigmas * states.lengths_std_m),
-        SoundMotionLimits(bounds_of(limits), limits.coupled, span_s, memory_s),
-        prediction.hand_m,
-        prediction.legs_radius_m,
-        np.append(limbs_m, THIGH_M) + ROUNDING_M,
-        radii,
-        surface(),
+    return SoundRules(
+        bounds=bounds_of(limits),
+        coupled=limits.coupled,
+        departure=departure_table(limits),
+        bounded=limits.departure is not None,
+        limbs_m=limbs_m,
+        body_m=np.append(limbs_m, THIGH_M) + ROUNDING_M,
+        hand_m=prediction.hand_m,
+        legs_m=prediction.legs_radius_m,
+        unknown_m=prediction.residual_unknown_m if prediction.residual else np.nan,
+        memory_s=memory_s,
     )
-    return vertices, offsets, radii
 
 
-def sound_radii(states: HumanStates, limbs_m: Floats, prediction: Prediction) -> Floats:
-    """(n, limbs) radii of volumes from the joints: those of the limbs (6,) [m] plus the errors of the model.
+class SoundRows(NamedTuple):
+    """The person of some ticks as input of the volumes, one row per tick; it does not depend on the horizon."""
 
-    These errors are the displacement by an error of a length up the chain, the residual, and the offset of the points
-    from the model that the residual refers to. An unknown residual (NaN) is replaced by ``residual_unknown_m``. The
-    lower body uses the thorax's. The residual of the legs is the distance of their middles from the line below the
-    pelvis; if its sum with a thigh's radius is larger, that sum is the radius. It is never reduced for legs last seen
-    close to the line, as a table may hide a later change.
+    at: Likely
+    tubed: Tubes
+    lengths: Floats  #: (n, 7) LENGTHS [m]
+    lengths_off: Floats  #: (n, 7) their largest errors [m]
+    radii: Floats  #: (n, limbs) radii of volumes from the joints [m]
+
+
+def sound_rows(states: HumanStates, prediction: Prediction, rules: SoundRules) -> SoundRows:
+    """Computes what the volumes of all horizons have in common.
+
+    Args:
+        states: The fused person.
+        prediction: Margins added to the model.
+        rules: From ``sound_rules``, for the same settings.
     """
-    found = np.empty((len(states), len(LIMBS) + prediction.legs))
-    unknown_m = prediction.residual_unknown_m if prediction.residual else np.nan
-    off = prediction.sigmas * states.lengths_std_m
-    _radii_rows(off, states.residual_m, _beside_m(states), limbs_m, prediction.legs_radius_m, unknown_m, found)
-    return found
+    rows = SoundRows(
+        at=start_states(states, prediction, rules.memory_s),
+        tubed=tubes(states, rules.bounded, rules.unknown_m, rules.memory_s),
+        lengths=np.ascontiguousarray(states.lengths_m),
+        lengths_off=np.ascontiguousarray(prediction.sigmas * states.lengths_std_m),
+        radii=np.empty((len(states), len(LIMBS) + prediction.legs)),
+    )
+    _radii_rows(rows, np.ascontiguousarray(states.residual_m), rules)
+    return rows
 
 
 #: Points of each of LIMBS that may have an offset from the model.
-_POINTS = (
-    (NECK, HEAD),
-    (ARM_POINTS[0][0], ARM_POINTS[1][0]),
-    *(ARM_POINTS[arm][part : part + 2] for arm in range(2) for part in range(2)),
+_POINTS = np.array(
+    [
+        (NECK, HEAD),
+        (ARM_POINTS[0][0], ARM_POINTS[1][0]),
+        *(ARM_POINTS[arm][part : part + 2] for arm in range(2) for part in range(2)),
+    ]
 )
 
 
-def _beside_m(states: HumanStates) -> Floats:
-    """(n, 6) offset of each limb's points from the model [m]."""
-    off = np.linalg.norm(states.points_m - skeleton(states.p, states.lengths_m), axis=2)
-    return np.column_stack([off[:, list(points)].max(axis=1) for points in _POINTS])
-
-
 @njit(cache=True)
-def _radii_rows(
-    off: Floats, residual: Floats, beside: Floats, limbs: Floats, legs: float, unknown: float, found: Floats
-) -> None:
-    """Writes the radii; if ``unknown``, the value for an unknown residual, is NaN, without the residual."""
-    for i in range(len(off)):
-        shoulder = np.hypot(off[i, 0], off[i, 2])
-        displaced = (0.0, 0.0, shoulder, shoulder + off[i, 4], shoulder, shoulder + off[i, 3])
+def _radii_rows(rows: SoundRows, residual: Floats, rules: SoundRules) -> None:
+    """Writes the radii of volumes from the joints: those of the limbs plus the errors of the model.
+
+    These errors are the displacement by an error of a length up the chain, the residual, and the offset of the points
+    from the model that the residual refers to. An unknown residual (NaN) is replaced by ``unknown_m``. The lower body
+    uses the thorax's. The residual of the legs is the distance of their middles from the line below the pelvis; if its
+    sum with a thigh's radius is larger, that sum is the radius. It is never reduced for legs last seen close to the
+    line, as a table may hide a later change.
+    """
+    unknown, points, found = rules.unknown_m, rows.tubed.points, rows.radii
+    modelled = np.full(points.shape[1:], np.nan)
+    for i in range(len(found)):
+        skeleton_row(rows.at.p[i], rows.lengths[i], modelled)
+        off = rows.lengths_off[i]
+        shoulder = np.hypot(off[0], off[2])
+        displaced = (0.0, 0.0, shoulder, shoulder + off[4], shoulder, shoulder + off[3])
         for limb in range(found.shape[1]):
-            base = legs + ROUNDING_M if limb == LEGS else limbs[limb] + displaced[limb] + ROUNDING_M
+            base = rules.legs_m + ROUNDING_M if limb == LEGS else rules.limbs_m[limb] + displaced[limb] + ROUNDING_M
             of = THORAX if limb == LEGS else limb
-            further = beside[i, of] + (unknown if np.isnan(residual[i, of]) else residual[i, of])
+            further = _beside_m(of, points[i], modelled) + (unknown if np.isnan(residual[i, of]) else residual[i, of])
             found[i, limb] = base if np.isnan(unknown) else base + further
         if len(found[i]) > LEGS and not np.isnan(unknown):  # at least their observed distance
             found[i, LEGS] = np.fmax(found[i, LEGS], residual[i, LEGS] + (THIGH_M + ROUNDING_M))
 
 
 @njit(cache=True)
-def _sweep_rows(
-    at: Likely,
-    tubed: Tubes,
-    lengths: Floats,
-    lengths_off: Floats,
-    within: SoundMotionLimits,
-    hand: float,
-    legs: float,
-    limb_radius: Floats,
-    radii: Floats,
-    work: Surface,
-) -> tuple[Floats, Ints]:
-    """Returns vertices and offsets; writes the radii of tubes, including the limb radii (7,), into ``radii``."""
-    limbs = radii.shape[1]
-    offsets = np.zeros(len(at.p) * limbs + 1, np.int64)
-    vertices = np.empty((len(at.p) * limbs * 80 + 80, 3))
+def _beside_m(limb: int, points: Floats, modelled: Floats) -> float:
+    """Largest offset of a limb's points from the model [m]."""
+    most = -np.inf
+    for k in _POINTS[limb]:
+        x, y, z = points[k, 0] - modelled[k, 0], points[k, 1] - modelled[k, 1], points[k, 2] - modelled[k, 2]
+        most = np.maximum(most, np.sqrt(x * x + y * y + z * z))
+    return most
+
+
+@njit(cache=True)
+def sweep_sound(
+    rows: SoundRows, first: int, last: int, span_s: float, rules: SoundRules, work: Surface
+) -> tuple[Floats, Ints, Floats]:
+    """Computes the swept volumes of all limbs for the rows ``first`` to ``last`` - 1.
+
+    Args:
+        rows: The person.
+        first: First row.
+        last: Row after the last one.
+        span_s: Horizon and latency [s].
+        rules: Settings and bounds.
+        work: From ``surface``.
+
+    Returns:
+        Vertices (m, 3) [m] and the offsets of ``SweptVolumes``, and (n, limbs) radii [m].
+    """
+    limbs, within = rows.radii.shape[1], SoundMotionLimits(rules.bounds, rules.coupled, span_s, rules.memory_s)
+    radii = rows.radii[first:last].copy()
+    offsets = np.zeros((last - first) * limbs + 1, np.int64)
+    vertices = np.empty(((last - first) * limbs * 80 + 80, 3))
     low, high, corners = np.empty(DOF), np.empty(DOF), np.empty((SIDES, 2))
     velocity, short = np.empty((len(POINTS), 3)), np.empty((MOST_POINTS, 3))
     n = 0
-    for i in range(len(at.p)):
-        if not tubed.usable[i, :limbs].all():
-            enclose_row(i, at, within, low, high, corners)
-        velocities(at.p[i], at.v[i], lengths[i], velocity)
+    for i in range(first, last):
+        if not rows.tubed.usable[i, :limbs].all():
+            enclose_row(i, rows.at, within, low, high, corners)
+        velocities(rows.at.p[i], rows.at.v[i], rows.lengths[i], velocity)
         for limb in range(limbs):
-            swept, count = short, 0
-            if tubed.usable[i, limb]:
-                reach = tubed.reach_s[i, limb]
-                count = tube(limb, tubed.points[i], velocity, within.horizon, reach, hand, tubed, short)
-                usable = np.isfinite(short[:count].sum())
-                thick = limb_radius[limb]
-                if limb == LEGS and not tubed.legs_shown[i]:
-                    hidden = max(legs, knees_out(at.p[i, HEIGHT]) + THIGH_M) + ROUNDING_M
-                    thick = np.fmax(hidden, tubed.legs_m[i] + limb_radius[limb])
-                radii[i, limb] = thick + departs_m(limb, reach, tubed.residual[i, limb], tubed)
-                if not usable:
-                    short[0], count = np.nan, 1
-            elif limb == LEGS:
-                swept, count = legs_around(corners, at.p[i, 2], low[HEIGHT], high[HEIGHT], legs)
+            if rows.tubed.usable[i, limb]:
+                count, radii[i - first, limb] = _tube(i, limb, rows, velocity, span_s, rules, short)
+                vertices = append(vertices, n, short, count)
             else:
-                swept, count = _limb(limb, low, high, corners, lengths[i], lengths_off[i], hand, work)
-            vertices = append(vertices, n, swept, count)
+                if limb == LEGS:
+                    swept, count = legs_around(corners, rows.at.p[i, 2], low[HEIGHT], high[HEIGHT], rules.legs_m)
+                else:
+                    ends = rows.lengths[i], rows.lengths_off[i]
+                    swept, count = _limb(limb, low, high, corners, *ends, rules.hand_m, work)
+                vertices = append(vertices, n, swept, count)
             n += count
-            offsets[i * limbs + limb + 1] = n
-    return vertices[:n].copy(), offsets
+            offsets[(i - first) * limbs + limb + 1] = n
+    return vertices[:n].copy(), offsets, radii
+
+
+@njit(cache=True)
+def _tube(
+    i: int, limb: int, rows: SoundRows, velocity: Floats, span_s: float, rules: SoundRules, swept: Floats
+) -> tuple[int, float]:
+    """Writes the points of a limb's tube; returns their number and the radius, which includes the limb's [m]."""
+    tubed, thick = rows.tubed, rules.body_m[limb]
+    reach_s = span_s + tubed.late_s[i, limb]
+    count = tube(limb, tubed.points[i], velocity, span_s, reach_s, rules.hand_m, rules.departure, swept)
+    if limb == LEGS and not tubed.legs_shown[i]:
+        hidden = max(rules.legs_m, knees_out(rows.at.p[i, HEIGHT]) + THIGH_M) + ROUNDING_M
+        thick = np.fmax(hidden, tubed.legs_m[i] + rules.body_m[limb])
+    if not np.isfinite(swept[:count].sum()):
+        swept[0], count = np.nan, 1
+    return count, thick + departs_m(limb, reach_s, tubed.residual[i, limb], rules.departure)
 
 
 @njit(cache=True)

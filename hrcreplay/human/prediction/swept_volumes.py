@@ -6,6 +6,7 @@ Corrections: docs/paper.md. With ``sound``, both enclose every motion of Eq. (25
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -24,7 +25,7 @@ from hrcreplay.human.model import (
     bounds_of,
 )
 from hrcreplay.human.prediction.sound_reach import SoundMotionLimits, enclose, start_states
-from hrcreplay.human.prediction.sound_volumes import sweep_sound
+from hrcreplay.human.prediction.sound_volumes import SoundRows, SoundRules, sound_rows, sound_rules, sweep_sound
 from hrcreplay.human.prediction.sweep import MOST_COPIES, append, box, kinematic_chain, sweep_rot, sweep_walk
 from hrcreplay.kernels import njit
 from hrcreplay.records import BODY, DOF, LIMBS, Bools, Floats, HumanStates, Ints, SweptVolumes, Table
@@ -245,21 +246,79 @@ def predict(
     Raises:
         SettingsError: The method is unknown.
     """
-    code, radius = code_of(prediction.method), limb_radii(prediction)
-    if code == SOUND:
-        vertices, offsets, radii = sweep_sound(
-            states, limits, prediction, radius, horizon_s + prediction.latency_s, memory_s
+    return Predictor(limits, prediction, memory_s).prepare(states).volumes(horizon_s)
+
+
+@dataclass(frozen=True)
+class Predictor:
+    """Swept volumes under some settings, for any person and horizon; see ``predict``."""
+
+    limits: LimitSet
+    prediction: Prediction
+    memory_s: float  #: time for which the filter continues without a measurement [s]
+
+    def prepare(self, states: HumanStates) -> PreparedPerson:
+        """Computes what the volumes of all horizons have in common.
+
+        Raises:
+            SettingsError: The method is unknown.
+        """
+        sound = code_of(self.prediction.method) == SOUND
+        rows = sound_rows(states, self.prediction, self.rules) if sound else None
+        return PreparedPerson(self, states, rows)
+
+    @cached_property
+    def limbs_m(self) -> Floats:
+        """(6,) radii of the limbs [m]."""
+        return limb_radii(self.prediction)
+
+    @cached_property
+    def rules(self) -> SoundRules:
+        """Settings and bounds of ``sound``."""
+        return sound_rules(self.limits, self.prediction, self.limbs_m, self.memory_s)
+
+    @cached_property
+    def work(self) -> Surface:
+        """Memory of the kernels."""
+        return surface()
+
+
+@dataclass(frozen=True)
+class PreparedPerson:
+    """The person of some ticks, prepared for volumes at any horizon."""
+
+    predictor: Predictor
+    states: HumanStates
+    rows: SoundRows | None  #: None for the printed methods
+
+    def volumes(self, horizon_s: float, first: int = 0, last: int | None = None) -> SweptVolumes:
+        """Computes the swept volumes of the ticks ``first`` to ``last`` - 1; see ``predict``.
+
+        Args:
+            horizon_s: Time after each tick until which they hold [s].
+            first: First tick.
+            last: Tick after the last one; None: all.
+        """
+        last, prediction = len(self.states) if last is None else last, self.predictor.prediction
+        t_ns = self.states.t_ns[first:last]
+        if self.rows is None:
+            return self._printed(self.states.rows(slice(first, last)), horizon_s)
+        span_s, rules, work = horizon_s + prediction.latency_s, self.predictor.rules, self.predictor.work
+        vertices, offsets, radii = sweep_sound(self.rows, first, last, span_s, rules, work)
+        return SweptVolumes(t_ns, offsets, vertices, radii, limbs_of(prediction), prediction.method)
+
+    def _printed(self, states: HumanStates, horizon_s: float) -> SweptVolumes:
+        limits, method = self.predictor.limits, self.predictor.prediction.method
+        vertices, offsets = _predict_rows(
+            np.ascontiguousarray(states.p),
+            np.ascontiguousarray(states.v),
+            find_never_measured(states),
+            np.ascontiguousarray(states.lengths_m),
+            MotionLimits(bounds_of(limits), limits.coupled, horizon_s, code_of(method)),
+            self.predictor.work,
         )
-        return SweptVolumes(states.t_ns, offsets, vertices, radii, limbs_of(prediction), prediction.method)
-    vertices, offsets = _predict_rows(
-        np.ascontiguousarray(states.p),
-        np.ascontiguousarray(states.v),
-        find_never_measured(states),
-        np.ascontiguousarray(states.lengths_m),
-        MotionLimits(bounds_of(limits), limits.coupled, horizon_s, code),
-        surface(),
-    )
-    return SweptVolumes(states.t_ns, offsets, vertices, np.tile(radius, (len(states), 1)), LIMBS, prediction.method)
+        radii = np.tile(self.predictor.limbs_m, (len(states), 1))
+        return SweptVolumes(states.t_ns, offsets, vertices, radii, LIMBS, method)
 
 
 @njit(cache=True)

@@ -30,8 +30,10 @@ _STRIDE = 2.0
 #: Minimum distance of a hand from its wrist that gives a direction [m].
 _SHORT_M = 0.02
 HEAD_LIMB, THORAX, LEGS = (BODY.index(limb) for limb in ("HD", "THX", "LEGS"))
-#: For each limb of BODY, itself and those of LIMBS that carry it: an arm on an unseen torso is unknown.
-_CARRIED_BY = ((0, 1), (1,), (1, 2), (1, 2, 3), (1, 4), (1, 4, 5), (1,))
+#: For each limb of BODY, True for itself and those of BODY that carry it: an arm on an unseen torso is unknown.
+_CARRIED_BY = np.zeros((7, 7), dtype=np.bool_)
+for _limb, _carrying in enumerate(((0, 1), (1,), (1, 2), (1, 2, 3), (1, 4), (1, 4, 5), (1,))):
+    _CARRIED_BY[_limb, _carrying] = True
 #: Maximum number of points of a tube.
 MOST_POINTS = 2 * (len(LEG_POINTS) + 2)
 _ARMS = np.array(ARM_POINTS)
@@ -45,50 +47,81 @@ class Tubes(NamedTuple):
     usable: Bools  #: (n, 7) True: the limb has a tube
     legs_shown: Bools  #: (n,) True: the positions of both knees and ankles are known
     legs_m: Floats  #: (n,) their distance from the line below the pelvis [m]; NaN: unknown or not used
-    reach_s: Floats  #: (n, 7) time for which it may depart [s]
-    horizon_s: Floats  #: (h,) of ``Departure``
+    late_s: Floats  #: (n, 7) time for which it may depart beyond horizon and latency, as it was seen that long ago [s]
+
+
+class DepartureTable(NamedTuple):
+    """The arrays of ``Departure``, contiguous; one horizon of zeros for a limit set without departures."""
+
+    horizon_s: Floats  #: (h,)
     beyond_m: Floats  #: (7, h)
     residuals: Floats  #: (7, h)
     rise_m: Floats  #: (h,) [m]
     sink_m: Floats  #: (h,) [m]
 
 
-def tubes(
-    states: HumanStates, limits: LimitSet, residual: bool, unknown_m: float, span_s: float, memory_s: float
-) -> Tubes:
-    """Makes the tubes of the limbs seen within the filter's memory, if the limit set bounds departures.
+def departure_table(limits: LimitSet) -> DepartureTable:
+    """Makes the table of a limit set."""
+    known = limits.departure
+    if known is None:
+        return DepartureTable(np.ones(1), np.zeros((len(BODY), 1)), np.zeros((len(BODY), 1)), np.zeros(1), np.zeros(1))
+    arrays = known.horizon_s, known.beyond_m, known.residuals, known.rise_m, known.sink_m
+    return DepartureTable(*(np.ascontiguousarray(array) for array in arrays))
+
+
+def tubes(states: HumanStates, bounded: bool, unknown_m: float, memory_s: float) -> Tubes:
+    """Makes the tubes of the limbs seen within the filter's memory.
 
     Args:
         states: The fused person.
-        limits: Bounds.
-        residual: True: use the distance from the model.
-        unknown_m: Value of that distance until it is known [m].
-        span_s: Horizon and latency [s].
+        bounded: True: the limit set bounds departures; otherwise no limb has a tube.
+        unknown_m: Distance from the model until it is known; NaN: distances from the model are not used [m].
         memory_s: Time for which the filter continues without a measurement [s].
     """
-    known = limits.departure
-    unseen = np.column_stack([states.unseen_s[:, list(carrying)].max(axis=1) for carrying in _CARRIED_BY])
-    usable, legs_shown = unseen <= memory_s, np.isfinite(states.points_m[:, BENDS].sum(axis=(1, 2)))
-    unseen[legs_shown, LEGS] = np.maximum(unseen, states.unseen_s)[legs_shown, LEGS]
-    of = states.residual_m[:, [0, 1, 2, 3, 4, 5, 1]]  # the residual of the legs is not related to departures
-    empty = np.zeros((len(BODY), 1))
-    return Tubes(
+    n = len(states)
+    found = Tubes(
         points=np.ascontiguousarray(states.points_m),
-        residual=np.where(np.isnan(of), unknown_m, of) if residual else np.zeros_like(of),
-        usable=np.ascontiguousarray(usable if known is not None else np.zeros_like(usable)),
-        legs_shown=legs_shown,
-        legs_m=np.where(residual, states.residual_m[:, LEGS], np.nan),
-        reach_s=span_s + np.clip(unseen - _FRESH_S, 0.0, memory_s),
-        horizon_s=np.ones(1) if known is None else np.ascontiguousarray(known.horizon_s),
-        beyond_m=empty if known is None else np.ascontiguousarray(known.beyond_m),
-        residuals=empty if known is None else np.ascontiguousarray(known.residuals),
-        rise_m=np.zeros(1) if known is None else np.ascontiguousarray(known.rise_m),
-        sink_m=np.zeros(1) if known is None else np.ascontiguousarray(known.sink_m),
+        residual=np.zeros((n, len(BODY))),
+        usable=np.zeros((n, len(BODY)), dtype=np.bool_),
+        legs_shown=np.empty(n, dtype=np.bool_),
+        legs_m=np.full(n, np.nan),
+        late_s=np.empty((n, len(BODY))),
     )
+    unseen_s, residual_m = np.ascontiguousarray(states.unseen_s), np.ascontiguousarray(states.residual_m)
+    _tube_rows(unseen_s, residual_m, bounded, unknown_m, memory_s, found)
+    return found
 
 
 @njit(cache=True)
-def departs_m(limb: int, reach_s: float, residual_m: float, at: Tubes) -> float:
+def _tube_rows(
+    unseen_s: Floats,
+    residual_m: Floats,
+    bounded: bool,
+    unknown_m: float,
+    memory_s: float,
+    found: Tubes,
+) -> None:
+    for i in range(len(unseen_s)):
+        found.legs_shown[i] = np.isfinite(found.points[i][BENDS].sum())
+        for limb in range(len(BODY)):
+            unseen = -np.inf
+            for carrying in range(len(BODY)):
+                if _CARRIED_BY[limb, carrying]:
+                    unseen = np.maximum(unseen, unseen_s[i, carrying])
+            found.usable[i, limb] = bounded and unseen <= memory_s
+            if limb == LEGS and found.legs_shown[i]:
+                unseen = np.maximum(unseen, unseen_s[i, LEGS])
+            found.late_s[i, limb] = np.minimum(np.maximum(unseen - _FRESH_S, 0.0), memory_s)
+            if not np.isnan(unknown_m):
+                # the residual of the legs is not related to departures
+                own = residual_m[i, THORAX if limb == LEGS else limb]
+                found.residual[i, limb] = unknown_m if np.isnan(own) else own
+        if not np.isnan(unknown_m):
+            found.legs_m[i] = residual_m[i, LEGS]
+
+
+@njit(cache=True)
+def departs_m(limb: int, reach_s: float, residual_m: float, table: DepartureTable) -> float:
     """Largest departure of a limb until ``reach_s`` [m].
 
     At least the residual, as the limb may already be there.
@@ -97,10 +130,10 @@ def departs_m(limb: int, reach_s: float, residual_m: float, at: Tubes) -> float:
         limb: Index into BODY.
         reach_s: Time since the tick [s].
         residual_m: The limb's residual [m]
-        at: Contains the table.
+        table: The bounds.
     """
-    beyond = _until(reach_s, at.horizon_s, at.beyond_m[limb])
-    times = np.interp(reach_s, at.horizon_s, at.residuals[limb])
+    beyond = _until(reach_s, table.horizon_s, table.beyond_m[limb])
+    times = np.interp(reach_s, table.horizon_s, table.residuals[limb])
     return max(residual_m, beyond + times * min(residual_m, NOISE_M) + max(0.0, residual_m - NOISE_M))
 
 
@@ -136,7 +169,14 @@ def velocities(p: Floats, v: Floats, lengths: Floats, found: Floats) -> None:
 
 @njit(cache=True)
 def tube(
-    limb: int, points: Floats, velocity: Floats, span_s: float, reach_s: float, hand_m: float, at: Tubes, swept: Floats
+    limb: int,
+    points: Floats,
+    velocity: Floats,
+    span_s: float,
+    reach_s: float,
+    hand_m: float,
+    table: DepartureTable,
+    swept: Floats,
 ) -> int:
     """Writes the points whose hull is a limb's tube before the ball, in place of Alg. 2; returns their number.
 
@@ -149,17 +189,17 @@ def tube(
         span_s: Horizon and latency [s].
         reach_s: Time after the tick until which the limb may depart [s].
         hand_m: Length of the hand beyond the wrist [m].
-        at: Contains the table.
+        table: The bounds.
         swept: (MOST_POINTS, 3) receives the points.
     """
     carries_s = _CARRIES_S if limb in (HEAD_LIMB, THORAX, LEGS) else _CARRIES_ARMS_S
-    unmeasured_s = max(0.0, span_s - at.horizon_s[-1])  # for these points only the velocity is known
+    unmeasured_s = max(0.0, span_s - table.horizon_s[-1])  # for these points only the velocity is known
     n = _ends(limb, points, velocity, min(span_s, carries_s + unmeasured_s), hand_m, swept)
     rising = 2 if limb == LEGS else n
     for i in range(rising):
         swept[n + i] = swept[i]
-        swept[n + i, 2] -= _until(reach_s, at.horizon_s, at.sink_m)
-        swept[i, 2] += _until(reach_s, at.horizon_s, at.rise_m)
+        swept[n + i, 2] -= _until(reach_s, table.horizon_s, table.sink_m)
+        swept[i, 2] += _until(reach_s, table.horizon_s, table.rise_m)
     return n + rising
 
 
