@@ -328,12 +328,13 @@ def plan(
     run_config, log = _planned(people.recording.run_config, robot, task, method, baselines), people.recording.log
     found = _MemoryTables()
     sink = found.sink()
-    chosen = assembly.planners(run_config, log, int(people.states.t_ns[0]))
-    controller = next(iter(chosen.values())).controller
-    sink.notes["plan"].extend(assembly.programme_notes(run_config, log, controller.reference))
+    model = assembly.robot(run_config, assembly.robot_base(run_config, log))
+    programme = assembly.programme(run_config, log, model)
+    sink.notes["plan"].extend(programme.notes)
+    moved = assembly.followers(run_config, programme, int(people.states.t_ns[0]))
     batches = (people.states.rows(slice(i, i + _BATCH)) for i in range(0, len(people), _BATCH))
-    around = assembly.surroundings(run_config, controller.robot)
-    for _ in stages.plan_batches(batches, around, chosen, stages.store_every(run_config), sink):
+    around = assembly.surroundings(run_config, model)
+    for _ in stages.plan_batches(batches, around, moved, stages.store_every(run_config), sink):
         pass
     return Plan(run_config, found.tables, collect_plan_findings(log, sink))
 
@@ -419,8 +420,10 @@ class Controller:
     def step(self, person: HumanStates) -> Motion:
         """Computes the robot's motion at a tick, one row; ``person`` is the row from ``Fusion.update``."""
         if self._started is None:
-            (planner,) = assembly.planners(self._run_config, self._log, int(person.t_ns[0])).values()
-            self._started = planner, assembly.surroundings(self._run_config, planner.controller.robot)
+            robot = assembly.robot(self._run_config, assembly.robot_base(self._run_config, self._log))
+            programme = assembly.programme(self._run_config, self._log, robot)
+            (planner,) = assembly.planners(self._run_config, programme, int(person.t_ns[0])).values()
+            self._started = planner, assembly.surroundings(self._run_config, robot)
         planner, around = self._started
         return planner.follow(person.t_ns, [Forecast(around, person).predict(0)], around.names)
 

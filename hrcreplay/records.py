@@ -74,6 +74,11 @@ NOBODY = -1
 #: Name of the border of a watched area among the volumes that a robot keeps clear of; all sides have this name.
 BORDER = "BORDER"
 
+#: Name of the motion of the robot as recorded, among the methods; it is no controller.
+RECORDED = "recorded"
+#: Methods whose motion rests on no volume: the programme without reaction, and the robot as recorded.
+UNGUARDED = ("none", RECORDED)
+
 #: POINTS with left and right exchanged.
 MIRROR = tuple(
     POINTS.index(name[:-1] + {"l": "r", "r": "l"}[name[-1]]) if name[-2:] in ("_l", "_r") else i

@@ -40,12 +40,14 @@ from hrcreplay.pipeline import assembly, reuse, stages
 from hrcreplay.pipeline.assembly import Forecast
 from hrcreplay.pipeline.run_config import RunConfig, RunOptions, resolve
 from hrcreplay.pipeline.stages import ProgressBar, Sink, collect_plan_findings, print_note
-from hrcreplay.records import Floats, Ints
+from hrcreplay.records import RECORDED, UNGUARDED, Floats, Ints
 from hrcreplay.reporting import comparison
 from hrcreplay.reporting.comparison import Variant
 from hrcreplay.reporting.summary_text import defect_notes
 from hrcreplay.robot.control.controllers import Planner
+from hrcreplay.robot.control.recorded import RecordedMotion
 from hrcreplay.robot.model import RobotModel
+from hrcreplay.robot.recorded import RecordedJoints
 from hrcreplay.robot.task import Reference
 from hrcreplay.settings.load import Settings
 from hrcreplay.settings.sections import Plan, Prediction
@@ -58,7 +60,7 @@ from hrcreplay.store.run_folder import RunWriter, Stopwatch
 PRESET = "none,ssm,shield,scaling,qp,qp:sound:fixed,qp:paper:fixed,scaling:paper:fixed"
 
 #: Approximate relative cost of a tick by method; long tasks start first.
-_COST = {"qp": 5, "ssm": 4, "none": 3, "shield": 3, "scaling": 3}
+_COST = {"qp": 5, "ssm": 4, "none": 3, "shield": 3, "scaling": 3, RECORDED: 2}
 
 
 @dataclass(frozen=True)
@@ -68,10 +70,12 @@ class PlacedProgramme:
     T_world_base: Floats  #: (4, 4)
     path: Reference
     start_s: float  #: programmed time at the first tick [s]
+    recorded: RecordedJoints | None  #: the robot as recorded; None: the log has no joints of this robot
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickles the programme without the robot; the other process makes the robot again."""
-        return PlacedProgramme, (self.T_world_base, replace(self.path, model=None), self.start_s)  # type: ignore[arg-type]
+        path = replace(self.path, model=None)  # type: ignore[arg-type]
+        return PlacedProgramme, (self.T_world_base, path, self.start_s, self.recorded)
 
 
 @dataclass(frozen=True)
@@ -128,13 +132,13 @@ def run(
             _compare_log(run_config, name, per_run[0], writer, watch, chunk_ticks, processes)
             for run_config, name in zip(run_configs, _names(run_configs), strict=True)
         ]
-        found = comparison.results(per_run[0], logs)
+        found = comparison.results(logs)
         for log_name, note in comparison.notes(found):
             print_note(f"{log_name}: {note}" if len(logs) > 1 else note)
         comparison.write(found, writer)
         comparison.print_tables(found)
         writer.timing.update(watch.summary(1.0 / run_configs[0].settings.fusion.rate_hz))
-        writer.finish(_meta(run_configs, per_run[0], began))
+        writer.finish(_meta(run_configs, list(found["methods"]), began))
         return writer.folder
 
 
@@ -214,9 +218,11 @@ def _compare_log(
         part.close_tables()
         people = read_recorded_people(run_config, log, part)
         part.close_tables()
+        programme, told_of_programme = _programme(run_config, log, int(ticks_ns[0]))
+        sink.notes["plan"].extend(told_of_programme)
+        if programme.recorded is not None:
+            variants = (_as_recorded(run_config), *variants)
         have = _motions(run_config, log, variants, ticks_ns, part)
-        programme = _programme(run_config, log, int(ticks_ns[0]))
-        sink.notes["plan"].extend(assembly.programme_notes(run_config, log, programme.path))
         full = _full_coverages(run_config, variants, people, part.partial)
         tasks = [
             VariantTask(
@@ -245,7 +251,7 @@ def _full_coverages(
 ) -> dict[str, Outcome | None]:
     """Computes the coverage of the person by the volumes of each occupancy until the braking time."""
     found: dict[str, Outcome | None] = {}
-    for variant in sorted(variants, key=lambda variant: variant.method == "none"):
+    for variant in sorted(variants, key=lambda variant: variant.method in UNGUARDED):
         if variant.occupancy not in found:
             mine = variant_run_config(run_config, variant)
             found[variant.occupancy] = compute_full_coverage(
@@ -270,16 +276,22 @@ def _notes(
         programme: Base pose of the robot.
         found: Findings of the stages in the log.
     """
-    motions = {v.label: folder / f"motion_{v.slug}.parquet" for v in variants if v.method != "none"}
+    motions = {v.label: folder / f"motion_{v.slug}.parquet" for v in variants if v.method not in UNGUARDED}
     robot = assembly.robot(run_config, programme.T_world_base)
     notes = notes_of(folder, run_config.meta(), found["notes"], motions, robot, run_config.settings.fusion.rate_hz)
     return defect_notes(found["counts"], notes)
 
 
-def _programme(run_config: RunConfig, log: Log, start_ns: int) -> PlacedProgramme:
+def _programme(run_config: RunConfig, log: Log, start_ns: int) -> tuple[PlacedProgramme, tuple[str, ...]]:
+    """Returns the programme of a log, and remarks on it."""
     base = assembly.robot_base(run_config, log)
-    path, begin_ns = assembly.reference(run_config, log, assembly.robot(run_config, base))
-    return PlacedProgramme(base, path, 0.0 if begin_ns is None else (start_ns - begin_ns) / 1e9)
+    found = assembly.programme(run_config, log, assembly.robot(run_config, base))
+    return PlacedProgramme(base, found.path, found.start_s(start_ns), found.recorded), found.notes
+
+
+def _as_recorded(run_config: RunConfig) -> Variant:
+    """Returns the variant of the robot as recorded, with the volumes of the settings."""
+    return Variant(RECORDED, run_config.settings.prediction.method, run_config.settings.plan.horizon)
 
 
 def _silent(_stage: str, _ticks: int) -> None:
@@ -409,16 +421,18 @@ def plan(task: VariantTask, progress: Callable[[int], None] | None = None) -> tu
     motion = pq.read_table(task.folder / f"motion_{slug}.parquet").to_pandas()
     predicted = Predicted(surroundings.prediction, states)
     own = compute_own_coverage(run_config, task.people, predicted, motion)
-    full = None if task.variant.method == "none" else task.full
+    full = None if task.variant.method in UNGUARDED else task.full
     rows = contact_table(run_config, robot, task.variant.method, motion, task.people, predicted, own, full)
     writer.table(f"contact_{slug}", rows)
     writer.close_tables()
     return done, time.perf_counter() - began_s
 
 
-def _planner(task: VariantTask, robot: RobotModel) -> Planner:
-    """Makes the controller of the variant at the start of the programme."""
+def _planner(task: VariantTask, robot: RobotModel) -> Planner | RecordedMotion:
+    """Makes the controller of the variant at the start of the programme, or the recorded motion."""
     run_config, programme = task.run_config, task.programme
+    if task.variant.method == RECORDED and programme.recorded is not None:
+        return assembly.recorded_motion(run_config, robot, programme.recorded)
     settings = assembly.plan_settings(run_config, 1.0 / run_config.settings.fusion.rate_hz, task.variant.method)
     path = replace(programme.path, model=robot)
     controller = assembly.make_controller(task.variant.method, robot, path, settings, programme.start_s)
@@ -434,7 +448,7 @@ class _TablesOf(RunWriter):
         return self.folder
 
 
-def _meta(run_configs: Sequence[RunConfig], variants: Sequence[Variant], began: datetime) -> dict[str, Any]:
+def _meta(run_configs: Sequence[RunConfig], methods: list[str], began: datetime) -> dict[str, Any]:
     others = [run_config.meta() for run_config in run_configs]
     return {
         **others[0],
@@ -442,6 +456,6 @@ def _meta(run_configs: Sequence[RunConfig], variants: Sequence[Variant], began: 
         "inputs": [part["inputs"][0] for part in others],
         "cells": [part["cell"] for part in others],
         "settings_by_log": [part["settings"] for part in others],
-        "methods": [variant.label for variant in variants],
+        "methods": methods,
         "created": f"{began:%Y-%m-%dT%H:%M:%SZ}",
     }

@@ -76,7 +76,9 @@ class Record:
     @cached_property
     def controller(self) -> Controller:
         """Makes the method's controller, at the start of its programme."""
-        (planner,) = assembly.planners(self.run_config, self.log, int(self.states.t_ns[0])).values()
+        robot = assembly.robot(self.run_config, assembly.robot_base(self.run_config, self.log))
+        programme = assembly.programme(self.run_config, self.log, robot)
+        (planner,) = assembly.planners(self.run_config, programme, int(self.states.t_ns[0])).values()
         return planner.controller
 
     def predict(self, tick: int) -> Predict:

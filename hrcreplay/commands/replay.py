@@ -178,11 +178,12 @@ def run_stages(
         states = read_states(folder / "state.parquet", size)
     flow: Iterable[Any] = states
     if "plan" in todo:
-        chosen = assembly.planners(run_config, log, int(ticks_ns[0]))
-        robot, path = (getattr(next(iter(chosen.values())).controller, name) for name in ("robot", "reference"))
-        sink.notes["plan"].extend(assembly.programme_notes(run_config, log, path))
+        robot = assembly.robot(run_config, assembly.robot_base(run_config, log))
+        programme = assembly.programme(run_config, log, robot)
+        sink.notes["plan"].extend(programme.notes)
+        moved = assembly.followers(run_config, programme, int(ticks_ns[0]))
         every = stages.store_every(run_config) if "predict" in todo else math.inf
-        flow = stages.plan_batches(states, assembly.surroundings(run_config, robot), chosen, every, sink)
+        flow = stages.plan_batches(states, assembly.surroundings(run_config, robot), moved, every, sink)
     elif "predict" in todo:
         flow = stages.predict_batches(
             states, assembly.prediction_stage(run_config), stages.store_every(run_config), sink

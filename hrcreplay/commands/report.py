@@ -145,6 +145,7 @@ def compute(run: Run, *, near_m: float, stationary_m_per_s: float, gap_s: float 
         stationary_m_per_s=stationary_m_per_s,
         max_reference_lead_m=float(setting(recorded, "plan", "max_reference_lead_m")),
         contact=run.contact,
+        recorded=run.recorded,
     )
     add_contact(metrics, run, stationary_m_per_s)
     return metrics.sorted()

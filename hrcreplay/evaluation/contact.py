@@ -27,7 +27,7 @@ from hrcreplay.pipeline import assembly, stages
 from hrcreplay.pipeline.assembly import PredictionStage
 from hrcreplay.pipeline.person_fuser import PersonFuser
 from hrcreplay.pipeline.run_config import RunConfig
-from hrcreplay.records import BODY, Bools, Floats, HumanStates, Ints, SweptVolume
+from hrcreplay.records import BODY, UNGUARDED, Bools, Floats, HumanStates, Ints, SweptVolume
 from hrcreplay.robot.model import LinkMotion, RobotModel
 from hrcreplay.store.columns import Columns, body_columns, contact_columns, read_states, state_columns
 from hrcreplay.store.run_folder import RunWriter
@@ -129,7 +129,7 @@ def compute_own_coverage(
         predicted: Volumes of any tick.
         motion: Rows of a motion table.
     """
-    if run_config.settings.plan.method == "none":
+    if run_config.settings.plan.method in UNGUARDED:
         return None
     states = predicted.all_states
     horizon_s = _at(states.t_ns, motion["t_ns"].to_numpy(), motion["horizon_s"].to_numpy(dtype=float))
@@ -138,7 +138,7 @@ def compute_own_coverage(
 
 def compute_full_coverage(run_config: RunConfig, people: RecordedPeople, predicted: Predicted) -> Outcome | None:
     """Coverage of every checked tick until the braking time T_s, as ``audit`` counts it."""
-    if run_config.settings.plan.method == "none":
+    if run_config.settings.plan.method in UNGUARDED:
         return None
     states = predicted.all_states
     horizon_s = np.full(len(states), predicted.stage.horizon_s)
@@ -172,7 +172,7 @@ def contact_table(
     person, other = nearest(robot, motion, (people.person, people.others), radii_m, prediction.hand_m)
     worst, of_other = choose_nearer(person, other)
     outside_m = np.full(len(t_ns), np.nan)
-    if method != "none":
+    if method not in UNGUARDED:
         outside_m = by_volume(motion, person, people.person, radii_m, prediction.hand_m, predicted)
     sources = tuple(track.source for track in people.tracks)
     return contact_columns(

@@ -52,7 +52,9 @@ class JointTrack(Table):
 
     t_ns: Ints  #: (n,) on the log's clock, increasing
     q: Floats  #: (n, nv) [rad]
+    dq: Floats  #: (n, nv) as recorded; NaN where the log gives none [rad/s]
     names: tuple[str, ...]  #: the robot's axes
+    gaps_ns: tuple[tuple[int, int], ...] = ()  #: begin and end of each silence of an axis, in order
 
 
 class Samples(NamedTuple):
@@ -60,6 +62,7 @@ class Samples(NamedTuple):
 
     message: Ints  #: (n,) row of the topic's ``arrival_ns`` and ``stamp_ns``
     position: Floats  #: (n,) in the log's unit
+    velocity: Floats  #: (n,) in the log's unit per second; NaN where the message gives none
 
 
 @dataclass(frozen=True)
@@ -90,7 +93,6 @@ class JointReading:
     track: JointTrack
     sources: Mapping[str, tuple[str, str]]  #: axis -> topic and name in the log
     clocks: tuple[Clock, ...]  #: clocks of the topics that are read
-    gaps_ns: Ints  #: (g, 2) begin and end of each silence of an axis, in order
     notes: tuple[str, ...]  #: for the user
 
 
@@ -121,10 +123,10 @@ def read_topics(source: LogFiles, names: Sequence[str], defects: Counter[str]) -
 
 def _read_topic(source: LogFiles, name: str, defects: Counter[str]) -> JointTopic:
     arrival, stamp = array("q"), array("q")
-    joints: dict[str, tuple[array[int], array[float]]] = {}
+    joints: dict[str, tuple[array[int], array[float], array[float]]] = {}
     for message in source.messages([name]):
         try:
-            t_ns, names, positions = _joint_state(message)
+            t_ns, names, positions, velocities = _joint_state(message)
         except Undecodable:
             defects["messages_undecodable"] += 1
             continue
@@ -134,14 +136,18 @@ def _read_topic(source: LogFiles, name: str, defects: Counter[str]) -> JointTopi
         if len(names) != len(positions) or len(set(names)) != len(names):
             defects["joints_malformed"] += 1
             continue
-        for joint, position in zip(names, positions, strict=True):
-            rows, values = joints.setdefault(joint, (array("q"), array("d")))
+        if len(velocities) != len(names):
+            velocities = [np.nan] * len(names)
+        for joint, position, velocity in zip(names, positions, velocities, strict=True):
+            rows, values, rates = joints.setdefault(joint, (array("q"), array("d"), array("d")))
             rows.append(len(arrival))
             values.append(position)
+            rates.append(velocity)
         arrival.append(message.arrival_ns)
         stamp.append(t_ns if 0 < t_ns < 1 << 62 else 0)
     series = {
-        joint: Samples(_ints(rows), np.array(values, dtype=np.float64)) for joint, (rows, values) in joints.items()
+        joint: Samples(_ints(rows), *(np.array(column, dtype=np.float64) for column in (values, rates)))
+        for joint, (rows, values, rates) in joints.items()
     }
     return JointTopic(name, _ints(arrival), _ints(stamp), series)
 
@@ -150,12 +156,14 @@ def _ints(values: array[int]) -> Ints:
     return np.array(values, dtype=np.int64)
 
 
-def _joint_state(message: Message) -> tuple[int, list[str], list[float]]:
+def _joint_state(message: Message) -> tuple[int, list[str], list[float], list[float]]:
+    """Returns stamp [ns], names, positions and velocities; an empty list for what the message lacks."""
     content = message.read()
     if message.topic.type == _OWN:
-        return content.t_ns, list(content.names), list(content.q)
-    names, positions = [str(name) for name in content.name], [float(q) for q in content.position]
-    return stamp_ns(content.header.stamp, message.topic.name), names, positions
+        return content.t_ns, list(content.names), list(content.q), []
+    names, velocities = [str(name) for name in content.name], [float(dq) for dq in content.velocity]
+    stamp = stamp_ns(content.header.stamp, message.topic.name)
+    return stamp, names, [float(q) for q in content.position], velocities
 
 
 def read_track(
@@ -183,17 +191,15 @@ def read_track(
         if used:
             clocks[topic.name], instants[topic.name] = place_in_time(topic, used, options.joints_offset_s, defects)
     scale = np.pi / 180.0 if options.joints_unit == "deg" else 1.0
-    tracks: dict[tuple[str, str], tuple[Ints, Floats]] = {}
+    tracks: dict[tuple[str, str], _Series] = {}
     for topic in topics:
         late: Bools = np.zeros(len(topic.arrival_ns), dtype=np.bool_)
         for joint in set(names.values()) & set(topic.joints):
             tracks[(topic.name, joint)] = _in_order(topic.joints[joint], instants[topic.name], scale, late, defects)
         defects["joints_out_of_order"] += int(late.sum())
     agreed = _agree(topics, names, chosen, tracks, where)
-    series = [tracks[(chosen[axis].name, names[axis])] for axis in axes]
-    track = _join(series, tuple(axes), where)
-    gaps_ns = _gaps(series, track)
-    defects["joint_gaps_ms"] += round(_covered_ns(gaps_ns) / 1e6)
+    track = _join([tracks[(chosen[axis].name, names[axis])] for axis in axes], tuple(axes), where)
+    defects["joint_gaps_ms"] += round(_covered_ns(track.gaps_ns) / 1e6)
     read = dict.fromkeys(topic.name for topic in chosen.values())
     notes = [
         *_match_names(topics, names, chosen),
@@ -202,7 +208,7 @@ def read_track(
         *_small_degrees(track, options.joints_unit),
     ]
     sources = {axis: (chosen[axis].name, names[axis]) for axis in axes}
-    return JointReading(track, sources, tuple(clocks[name] for name in read), gaps_ns, tuple(notes))
+    return JointReading(track, sources, tuple(clocks[name] for name in read), tuple(notes))
 
 
 def match_names(topics: Sequence[JointTopic], axes: Sequence[str], given: Sequence[str], where: str) -> dict[str, str]:
@@ -307,17 +313,17 @@ def _agree(
     topics: Sequence[JointTopic],
     names: Mapping[str, str],
     chosen: Mapping[str, JointTopic],
-    tracks: Mapping[tuple[str, str], tuple[Ints, Floats]],
+    tracks: Mapping[tuple[str, str], _Series],
     where: str,
 ) -> Iterator[str]:
     """Returns remarks on axes in several topics, whose positions must agree."""
     beside: dict[tuple[str, str], float] = {}
     for axis, name in names.items():
-        t_ns, q = tracks[(chosen[axis].name, name)]
+        t_ns, q, _ = tracks[(chosen[axis].name, name)]
         for topic in topics:
             if topic is chosen[axis] or name not in topic.joints:
                 continue
-            other_ns, other = tracks[(topic.name, name)]
+            other_ns, other, _ = tracks[(topic.name, name)]
             within = (other_ns >= t_ns[0]) & (other_ns <= t_ns[-1]) if len(t_ns) else np.zeros(0, dtype=np.bool_)
             apart = np.abs(_at(other_ns[within], t_ns, q) - other[within]) if within.any() else np.zeros(1)
             pair = chosen[axis].name, topic.name
@@ -472,16 +478,25 @@ def _parts(delay_ns: Ints) -> list[Ints]:
     return np.array_split(delay_ns, int(np.clip(len(delay_ns) // 20, 1, 20)))
 
 
-def _in_order(samples: Samples, t_ns: Ints, scale: float, late: Bools, defects: Counter[str]) -> tuple[Ints, Floats]:
-    """Returns instants and positions [rad] of a joint, without those not finite or not later than earlier ones."""
+class _Series(NamedTuple):
+    """One axis on its own clock."""
+
+    t_ns: Ints  #: (n,) increasing
+    q: Floats  #: (n,) [rad]
+    dq: Floats  #: (n,) NaN where not given [rad/s]
+
+
+def _in_order(samples: Samples, t_ns: Ints, scale: float, late: Bools, defects: Counter[str]) -> _Series:
+    """Returns the series of a joint, without positions that are not finite or not later than earlier ones."""
     finite: Bools = np.isfinite(samples.position)
     defects["joints_not_finite"] += int((~finite).sum())
     messages = samples.message[finite]
-    times, q = t_ns[messages], samples.position[finite] * scale
+    times = t_ns[messages]
     before = np.concatenate([[np.iinfo(np.int64).min], np.maximum.accumulate(times)[:-1]]) if len(times) else times
     increasing = times > before
     late[messages[~increasing]] = True
-    return times[increasing], q[increasing]
+    q, dq = (column[finite][increasing] * scale for column in (samples.position, samples.velocity))
+    return _Series(times[increasing], q, dq)
 
 
 def _at(t_ns: Ints, known_ns: Ints, q: Floats) -> Floats:
@@ -489,35 +504,36 @@ def _at(t_ns: Ints, known_ns: Ints, q: Floats) -> Floats:
     return np.asarray(np.interp((t_ns - known_ns[0]).astype(float), (known_ns - known_ns[0]).astype(float), q))
 
 
-def _join(series: Sequence[tuple[Ints, Floats]], axes: tuple[str, ...], where: str) -> JointTrack:
+def _join(series: Sequence[_Series], axes: tuple[str, ...], where: str) -> JointTrack:
     """Joins all axes at each instant with a position of any axis, while all are known."""
-    for axis, (times, _) in zip(axes, series, strict=True):
-        if not len(times):
+    for axis, one in zip(axes, series, strict=True):
+        if not len(one.t_ns):
             raise LogError(f"{where}: {axis} has no position that is a number; a joint track needs two of every axis")
-    first, last = max(int(t[0]) for t, _ in series), min(int(t[-1]) for t, _ in series)
+    first, last = max(int(one.t_ns[0]) for one in series), min(int(one.t_ns[-1]) for one in series)
     if first > last:
         raise LogError(f"{where}: the robot's axes {', '.join(axes)} are never known at one time")
-    union = np.unique(np.concatenate([t for t, _ in series]))
+    union = np.unique(np.concatenate([one.t_ns for one in series]))
     union = union[(union >= first) & (union <= last)]
-    columns = [q if np.array_equal(t, union) else _at(union, t, q) for t, q in series]
-    return JointTrack(union, np.column_stack(columns), axes)
+    q, dq = (
+        np.column_stack([c if np.array_equal(one.t_ns, union) else _at(union, one.t_ns, c) for one, c in columns])
+        for columns in ([(one, one.q) for one in series], [(one, one.dq) for one in series])
+    )
+    return JointTrack(union, q, dq, axes, _gaps(series, first, last))
 
 
-def _gaps(series: Sequence[tuple[Ints, Floats]], track: JointTrack) -> Ints:
-    """(g, 2) instants between which an axis has no position for longer than GAP_S, in order."""
+def _gaps(series: Sequence[_Series], first: int, last: int) -> tuple[tuple[int, int], ...]:
+    """Returns instants from ``first`` to ``last`` between which an axis has no position for longer than GAP_S."""
     found: set[tuple[int, int]] = set()
-    for times, _ in series:
+    for times, _, _ in series:
         at = np.flatnonzero(np.diff(times) > GAP_S * _NS)
         found |= {(int(a), int(b)) for a, b in zip(times[at], times[at + 1], strict=True)}
-    first, last = int(track.t_ns[0]), int(track.t_ns[-1])
-    inside = sorted((max(a, first), min(b, last)) for a, b in found if b > first and a < last)
-    return np.array(inside, dtype=np.int64).reshape(-1, 2)
+    return tuple(sorted((max(a, first), min(b, last)) for a, b in found if b > first and a < last))
 
 
-def _covered_ns(gaps_ns: Ints) -> int:
-    """Computes the total time with at least one missing axis [ns], from gaps (g, 2) in order."""
+def _covered_ns(gaps_ns: Sequence[tuple[int, int]]) -> int:
+    """Computes the total time with at least one missing axis [ns], from gaps in order."""
     covered, until = 0, 0
-    for begin, end in gaps_ns.tolist():
+    for begin, end in gaps_ns:
         covered += max(0, end - max(begin, until))
         until = max(until, end)
     return covered
@@ -527,25 +543,26 @@ def coverage_remarks(reading: JointReading, start_ns: int, end_ns: int) -> Itera
     """Returns remarks on a track with gaps, or one shorter than the log.
 
     Args:
-        reading: The track and its gaps.
+        reading: The track.
         start_ns: First arrival of the log.
         end_ns: Last arrival.
     """
-    gaps_ns, times = reading.gaps_ns, reading.track.t_ns
+    gaps_ns, times = reading.track.gaps_ns, reading.track.t_ns
     begin_s, last_s, length_s = ((int(t) - start_ns) / _NS for t in (times[0], times[-1], end_ns))
     if begin_s > GAP_S or length_s - last_s > GAP_S:
         yield (
             f"robot joints: known from {begin_s:.2f} s to {last_s:.2f} s of the log, which lasts {length_s:.2f} s; "
-            "before and after, the programme stands still"
+            "before and after, the robot is not known, and a programme made of its motion stands still"
         )
-    if not len(gaps_ns):
+    if not gaps_ns:
         return
     covered_s = _covered_ns(gaps_ns) / _NS
-    longest = gaps_ns[np.argmax(gaps_ns[:, 1] - gaps_ns[:, 0])]
+    longest = max(gaps_ns, key=lambda gap: gap[1] - gap[0])
     yield (
         f"robot joints: gaps of more than {GAP_S:g} s: {len(gaps_ns)}, {covered_s:.2f} s in all, the longest of "
         f"{(longest[1] - longest[0]) / _NS:.2f} s from {(longest[0] - start_ns) / _NS:.2f} s of the log on. There the "
-        "programme is a straight line in joint space from the last known position to the next, without measurements"
+        "robot is not known, and a programme made of its motion is a straight line in joint space from the last known "
+        "position to the next"
     )
 
 

@@ -24,13 +24,27 @@ from hrcreplay.logs.cleaning import PersonMemory, select_person
 from hrcreplay.logs.joints import JointTrack
 from hrcreplay.logs.log_files import Header
 from hrcreplay.pipeline.run_config import RunConfig, UrdfFiles, link_capsules
-from hrcreplay.records import BORDER, NOBODY, Bools, CameraFrames, Floats, HumanStates, Ints, Measurements, SweptVolumes
+from hrcreplay.records import (
+    BORDER,
+    NOBODY,
+    RECORDED,
+    UNGUARDED,
+    Bools,
+    CameraFrames,
+    Floats,
+    HumanStates,
+    Ints,
+    Measurements,
+    SweptVolumes,
+)
 from hrcreplay.robot.control.border import Border
 from hrcreplay.robot.control.control_step import PlanSettings
 from hrcreplay.robot.control.controllers import CONTROLLERS, Controller, Planner, Predict
+from hrcreplay.robot.control.recorded import RecordedMotion
 from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.robot.model import RobotModel, Segment, from_urdf, irb140
-from hrcreplay.robot.path import plan_programme, recorded_remarks, smooth_recorded
+from hrcreplay.robot.path import check_recorded, plan_programme, recorded_remarks, smooth_recorded
+from hrcreplay.robot.recorded import RecordedJoints, time_cut_ns, waiting_remarks
 from hrcreplay.robot.task import Reference, Task, parse_task
 from hrcreplay.settings.sections import Fusion, Prediction, Robot
 
@@ -345,15 +359,31 @@ def _robot(settings: Robot, files: UrdfFiles | None, stop_s: float, T_world_base
     )
 
 
-def reference(run_config: RunConfig, log: LogLike, model: RobotModel) -> tuple[Reference, int | None]:
+@dataclass(frozen=True)
+class Programme:
+    """The programmed path of a run, and the robot as recorded."""
+
+    path: Reference
+    notes: tuple[str, ...]  #: for the user
+    begin_ns: int | None = None  #: instant at which the path starts, if the log gives one [ns]
+    cuts_ns: tuple[tuple[int, int], ...] = ()  #: spans of the record that are not in the path [ns]
+    recorded: RecordedJoints | None = None  #: None: the log has no joints of this robot
+
+    def start_s(self, start_ns: int) -> float:
+        """Programmed time at the first tick [s]."""
+        if self.begin_ns is None:
+            return 0.0
+        return (start_ns - self.begin_ns - time_cut_ns(self.cuts_ns, start_ns)) / 1e9
+
+
+def programme(run_config: RunConfig, log: LogLike, model: RobotModel) -> Programme:
     """Makes the programmed path: from the task file, else the log's task, else the log's joint track.
 
-    Returns:
-        The path, and the instant at which it starts, if the log gives one [ns].
+    With a task, joints of the log that do not fit the robot give a note.
 
     Raises:
         SettingsError: The task cannot be used, or there is none.
-        LogError: The joint track does not fit the robot.
+        LogError: Without a task: the joint track does not fit the robot.
     """
     own = (log.header.task, f"{log.header.path}: task")
     file = run_config.settings.plan.task
@@ -361,7 +391,8 @@ def reference(run_config: RunConfig, log: LogLike, model: RobotModel) -> tuple[R
     if table is not None:
         parts = run_config.settings.robot, run_config.urdf, run_config.settings.prediction.stop_s
         path = _programme(parse_task(table, where), where, *parts, model.T_world_base.tobytes())
-        return replace(path, model=model), None
+        recorded, notes = _recorded_beside_task(log, model)
+        return Programme(replace(path, model=model), notes, recorded=recorded)
     track = log.joints(model.joint_names)
     if track is None:
         empty = f" ({', '.join(log.header.joint_topics)}: no positions that go with their names)"
@@ -369,20 +400,33 @@ def reference(run_config: RunConfig, log: LogLike, model: RobotModel) -> tuple[R
             f"{log.header.path}: no task and no joint track{empty if log.header.joint_topics else ''}; "
             "name a task file with --set plan.task=FILE.toml"
         )
-    return smooth_recorded(track.t_ns, track.q, model), int(track.t_ns[0])
+    recorded, least_s, begin_ns = _recorded(track, model), run_config.settings.plan.waiting_s, int(track.t_ns[0])
+    cuts_ns = () if least_s == "keep" else recorded.waits(least_s)
+    path = smooth_recorded(*recorded.without(cuts_ns), model)
+    waiting = [] if least_s == "keep" else waiting_remarks(cuts_ns, begin_ns, least_s)
+    notes = (*log.joint_notes, *waiting, *recorded_remarks(path))
+    return Programme(path, notes, begin_ns, cuts_ns, recorded)
 
 
-def programme_notes(run_config: RunConfig, log: LogLike, path: Reference) -> list[str]:
-    """Returns remarks on a recorded joint track used as the programme; none for a task.
+def _recorded(track: JointTrack, model: RobotModel) -> RecordedJoints:
+    """Makes the robot as recorded.
 
-    Args:
-        run_config: The run.
-        log: Log of the run; its joints were read for the path.
-        path: Result of ``reference``.
+    Raises:
+        LogError: The joint track does not fit the robot.
     """
-    if run_config.task or log.header.task:
-        return []
-    return [*log.joint_notes, *recorded_remarks(path)]
+    t_ns, q = check_recorded(track.t_ns, track.q, model)
+    return RecordedJoints(t_ns, q, track.dq, track.gaps_ns)
+
+
+def _recorded_beside_task(log: LogLike, model: RobotModel) -> tuple[RecordedJoints | None, tuple[str, ...]]:
+    """Returns the robot as recorded in a log whose programme is a task, with remarks; None without joints that fit."""
+    if not log.header.joint_topics:
+        return None, ()
+    try:
+        track = log.joints(model.joint_names)
+        return (None, ()) if track is None else (_recorded(track, model), log.joint_notes)
+    except (LogError, SettingsError) as error:
+        return None, (f"the robot as recorded is not judged: {str(error).removeprefix(f'{log.header.path}: ')}",)
 
 
 @lru_cache(maxsize=4)  # a live session makes its controller twice: to compile the kernels, and to run
@@ -394,18 +438,29 @@ def _programme(
     return plan_programme(task, model, where)
 
 
-def planners(run_config: RunConfig, log: LogLike, start_ns: int) -> dict[str, Planner]:
+def planners(run_config: RunConfig, given: Programme, start_ns: int) -> dict[str, Planner]:
     """Makes stage 3: the chosen method and its baselines, each with its own robot."""
-    plan, model = run_config.settings.plan, robot(run_config, robot_base(run_config, log))
-    path, begin_ns = reference(run_config, log, model)
-    dt_s = 1.0 / run_config.settings.fusion.rate_hz
-    s_s = 0.0 if begin_ns is None else (start_ns - begin_ns) / 1e9
+    plan, dt_s, s_s = run_config.settings.plan, 1.0 / run_config.settings.fusion.rate_hz, given.start_s(start_ns)
 
     def planner(name: str) -> Planner:
-        controller = make_controller(name, model, path, plan_settings(run_config, dt_s, name), s_s)
-        return Planner(controller, chosen=name == plan.method)
+        settings = plan_settings(run_config, dt_s, name)
+        return Planner(make_controller(name, given.path.model, given.path, settings, s_s), chosen=name == plan.method)
 
     return {name: planner(name) for name in dict.fromkeys((plan.method, *plan.baselines))}
+
+
+def recorded_motion(run_config: RunConfig, model: RobotModel, joints: RecordedJoints) -> RecordedMotion:
+    """Makes the robot as recorded, beside the volumes of the run."""
+    settings = plan_settings(run_config, 1.0 / run_config.settings.fusion.rate_hz, RECORDED)
+    return RecordedMotion(model, joints, settings)
+
+
+def followers(run_config: RunConfig, given: Programme, start_ns: int) -> dict[str, Planner | RecordedMotion]:
+    """Makes all motions of a run: the chosen method, its baselines and, with joints in the log, the recorded robot."""
+    found: dict[str, Planner | RecordedMotion] = {**planners(run_config, given, start_ns)}
+    if given.recorded is not None:
+        found[RECORDED] = recorded_motion(run_config, given.path.model, given.recorded)
+    return found
 
 
 def robot_base(run_config: RunConfig, log: LogLike) -> Floats:
@@ -431,7 +486,7 @@ def plan_settings(run_config: RunConfig, dt_s: float, method: str) -> PlanSettin
         stop_s=prediction.stop_s,
         latency_s=prediction.latency_s,
         spare_ticks=int(run_config.command == "live"),
-        certified=plan.certify and method != "none",
+        certified=plan.certify and method not in UNGUARDED,
         retreat_m=plan.retreat_m if plan.certify and method == "qp" else 0.0,
     )
 

@@ -79,11 +79,17 @@ def dependencies(run_config: RunConfig, log: LogLike, ticks_ns: Ints) -> dict[st
         base = assembly.known_robot_base(run_config, log)
         found |= {
             "base": None if base is None else base.tolist(),
-            "programme": run_config.task or log.header.task or {key: settings["logs"][key] for key in _JOINT_SETTINGS},
+            "programme": _programme(run_config, log, {key: settings["logs"][key] for key in _JOINT_SETTINGS}),
             "settings robot": [_without(settings["robot"], "urdf", "packages"), urdf_digest(run_config.settings)],
             "settings plan": _without(settings["plan"], "task"),
         }
     return {name: _digest(part) for name, part in found.items()}
+
+
+def _programme(run_config: RunConfig, log: LogLike, joint_settings: dict[str, Any]) -> Any:
+    """Returns what the programme and the robot as recorded depend on, beside the log."""
+    task = run_config.task or log.header.task
+    return [task, joint_settings] if task and log.header.joint_topics else task or joint_settings
 
 
 def stage_digests(run_config: RunConfig, found: Mapping[str, str]) -> dict[str, str]:

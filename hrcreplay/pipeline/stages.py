@@ -38,6 +38,7 @@ from hrcreplay.records import (
     SweptVolumes,
 )
 from hrcreplay.robot.control.controllers import Planner
+from hrcreplay.robot.control.recorded import RecordedMotion
 from hrcreplay.settings.sections import Fusion
 from hrcreplay.store.columns import (
     measurement_columns,
@@ -419,7 +420,7 @@ def predict_batches(
 def plan_batches(
     states: Iterable[HumanStates],
     surroundings: Surroundings,
-    planners: dict[str, Planner],
+    planners: Mapping[str, Planner | RecordedMotion],
     store_every: float,
     sink: Sink,
 ) -> Iterator[None]:

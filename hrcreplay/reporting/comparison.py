@@ -19,7 +19,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from hrcreplay.records import Floats
+from hrcreplay.records import RECORDED, UNGUARDED, Floats
 from hrcreplay.reporting.figures import drawing, planning
 from hrcreplay.reporting.metrics.contact import PERSONS, add_contact
 from hrcreplay.reporting.metrics.planning import PAPER, add_plan, is_moving
@@ -45,8 +45,8 @@ class Variant:
 
     @property
     def label(self) -> str:
-        """Label in the form that ``--methods`` takes; ``none`` has no volumes."""
-        return self.method if self.method == "none" else f"{self.method}:{self.occupancy}:{self.horizon}"
+        """Label in the form that ``--methods`` takes; ``none`` and ``recorded`` have no volumes."""
+        return self.method if self.method in UNGUARDED else f"{self.method}:{self.occupancy}:{self.horizon}"
 
     @property
     def slug(self) -> str:
@@ -185,6 +185,13 @@ _METRICS = {
 }
 
 
+#: Figures that need a controller, a programme or a certificate; the robot as recorded has none.
+_OF_CONTROLLERS = (
+    *("touch_inside_ticks", "touch_retreating_ticks", "touch_outside_ticks", "touch_unpredicted_ticks"),
+    *("uncertified_ticks", "retreating_ticks", "retreating_overlap_m", "standing_ticks", "braking_events"),
+)
+
+
 def figures(variant: Variant, motion: pd.DataFrame, contact: pd.DataFrame, bounds: Bounds) -> dict[str, Any]:
     """Computes the figures of a variant on one log: FIELDS, and ``braking_events_by_cause``; None if inapplicable.
 
@@ -204,11 +211,14 @@ def figures(variant: Variant, motion: pd.DataFrame, contact: pd.DataFrame, bound
     causes = braking_events(motion, bounds.stationary_m_per_s)
     found["braking_events"] = sum(causes.values())
     jerk = _jerk(motion)
+    jerk = jerk[np.isfinite(jerk).all(axis=1)]  # accelerations are not recorded
     found["jerk_rms_rad_per_s3"] = float(np.sqrt(np.mean(jerk**2))) if jerk.size else None
     found["jerk_max_rad_per_s3"] = float(np.abs(jerk).max()) if jerk.size else None
     for prefix, until in (("", "volumes"), ("full_", "volumes_full")):
         left, checked = metrics[f"{until}_left_ticks"]["value"], found[f"{prefix}checked_ticks"]
         found[f"{prefix}held_ticks"] = None if checked is None else checked - left
+    if variant.method == RECORDED:
+        found |= dict.fromkeys(_OF_CONTROLLERS)
     return _add_ratios(found) | {"braking_events_by_cause": causes}
 
 
@@ -281,13 +291,15 @@ def total(each: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return _add_ratios(found) | {"braking_events_by_cause": dict(sorted(causes.items()))}
 
 
-def results(variants: Sequence[Variant], logs: Sequence[LogResult]) -> dict[str, Any]:
-    """Returns the content of compare.json."""
+def results(logs: Sequence[LogResult]) -> dict[str, Any]:
+    """Returns the content of compare.json; the robot as recorded stands first, on the logs that contain it."""
+    every = dict.fromkeys(variant for log in logs for variant in log.figures)
+    methods = sorted(every, key=lambda variant: variant.method != RECORDED)
     return {
         "methods": {
             variant.label: {"method": variant.method}
-            | ({} if variant.method == "none" else {"occupancy": variant.occupancy, "horizon": variant.horizon})
-            for variant in variants
+            | ({} if variant.method in UNGUARDED else {"occupancy": variant.occupancy, "horizon": variant.horizon})
+            for variant in methods
         },
         "fields": {field.name: {"unit": field.unit, "meaning": field.meaning} for field in FIELDS},
         "logs": [
@@ -297,13 +309,14 @@ def results(variants: Sequence[Variant], logs: Sequence[LogResult]) -> dict[str,
                 "person": log.person,
                 "seconds": log.seconds,
                 "notes": list(log.notes),
-                "methods": {variant.label: _select_told(log.figures[variant], 1) for variant in variants},
+                "methods": {variant.label: _select_told(figures, 1) for variant, figures in log.figures.items()},
             }
             for log in logs
         ],
         "total": {
-            variant.label: _select_told(total([log.figures[variant] for log in logs]), len(logs))
-            for variant in variants
+            variant.label: _select_told(total(rows), len(rows))
+            for variant in methods
+            for rows in [[log.figures[variant] for log in logs if variant in log.figures]]
         },
         "paper": {
             name: {"value": PAPER[f"paper_stationary_share_{name}"][0], "unit": "1", "meaning": _PAPER}
@@ -396,9 +409,8 @@ def page_tables(found: Mapping[str, Any]) -> tuple[PageTable, ...]:
 def _note(found: Mapping[str, Any]) -> str:
     """Returns a note on the numbers and those of the paper."""
     persons = sorted({PERSONS.get(log["person"], log["person"]) for log in found["logs"]})
-    known, ticks = (
-        sum(next(iter(log["methods"].values()))[name] for log in found["logs"]) for name in ("known_ticks", "ticks")
-    )
+    of_plans = [next(row for method, row in log["methods"].items() if method != RECORDED) for log in found["logs"]]
+    known, ticks = (sum(row[name] for row in of_plans) for name in ("known_ticks", "ticks"))
     qp, scaling = (share_text(found["paper"][name]["value"], 2) for name in ("qp", "scaling"))
     outside, other = (
         sum(row[f"touch_{of}_ticks"] or 0 for row in found["total"].values()) for of in ("outside", "other")

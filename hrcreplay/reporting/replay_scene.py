@@ -10,9 +10,9 @@ import pandas as pd
 from scipy.spatial.transform import Rotation
 
 from hrcreplay.human.model import skeleton
-from hrcreplay.records import JOINTS, LENGTHS, POINTS, Bools, Floats, Ints
+from hrcreplay.records import JOINTS, LENGTHS, POINTS, RECORDED, Bools, Floats, Ints
 from hrcreplay.reporting.figures.drawing import BONES
-from hrcreplay.reporting.metrics.contact import StopEvent, method_prefixes, stop_events
+from hrcreplay.reporting.metrics.contact import StopEvent, method_prefixes, motion_of, stop_events
 from hrcreplay.reporting.metrics.planning import numeric_column
 from hrcreplay.reporting.metrics.series import seconds_from, times
 from hrcreplay.robot.control.control_step import stop_axis_by_axis
@@ -219,10 +219,8 @@ def replay_scene(run: Run, robot: RobotModel, t0_ns: int, radii_m: Mapping[str, 
     step_ns = round(1e9 / RATE_HZ)
     t_ns = first + step_ns * np.arange((last - first) // step_ns + 1)
     parts = tuple(part for part in radii_m if run.body is not None and f"{part}_0_x" in run.body)
-    tables = {
-        method: run.motion if prefix == "plan" else run.baselines[method]
-        for method, prefix in method_prefixes(run).items()
-    }
+    prefixes = sorted(method_prefixes(run).items(), key=lambda pair: pair[1] != "plan")
+    tables = {method: motion_of(run, prefix) for method, prefix in prefixes}
     slow = float(setting(run.meta.get("settings", {}), "report", "stationary_m_per_s"))
     return ReplayScene(
         t0_ns=t0_ns,
@@ -366,7 +364,7 @@ def _stops(
         dt_s = float(np.median(np.diff(times(motion)))) * 1e-9
         ends = [stop_axis_by_axis(*row, robot.ddq_max, dt_s).q[-1] for row in zip(q, dq, strict=True)]  # Eq. (67)
         return np.where(np.isfinite(tau_s)[:, None], np.array(ends), np.nan)
-    if "programme_s" not in motion:
+    if method == RECORDED or "programme_s" not in motion:
         return straight
     driven = pd.concat([motion, *(table for name, table in run.baselines.items() if name == "none")])
     s_s, first = np.unique(numeric_column(driven, "programme_s"), return_index=True)

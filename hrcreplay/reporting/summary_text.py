@@ -57,24 +57,26 @@ class Card:
 
 @dataclass(frozen=True)
 class Answer:
-    """One of two questions, the answer in a few words, and its explanation: one paragraph per line."""
+    """One of the questions, the answer in a few words, and its explanation: one paragraph per line."""
 
     question: str
     short: str
     words: str
 
 
+RAN = "Was it safe as it ran?"
 SAFE = "Could the robot always have stopped before it reached the person?"
 COST = "What would it have cost the task?"
 
 
 def answers(run: Run, metrics: Mapping[str, Metric]) -> tuple[Answer, ...]:
-    """Answers both questions of the page."""
+    """Answers the questions of the page; the first one only for a log with the joints of the robot."""
     if run.motion is None:
         stage = "predicted what the person could reach" if run.occupancy is not None else "fused the cameras"
         words = f"This run {stage} and moved no robot. Run plan or report on the same log to have it answered."
         return (Answer(SAFE, "Not asked in this run.", words), Answer(COST, "Not asked in this run.", ""))
-    return (_with_unmeasured(_safety(run, metrics), metrics), _cost(run, metrics))
+    ran = () if run.recorded is None or run.contact is None else (Answer(RAN, *verdict.answer_as_it_ran(metrics)),)
+    return (*ran, _with_unmeasured(_safety(run, metrics), metrics), _cost(run, metrics))
 
 
 def _with_unmeasured(safe: Answer, metrics: Mapping[str, Metric]) -> Answer:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from hrcreplay.records import LIMBS
+from hrcreplay.records import LIMBS, RECORDED
 from hrcreplay.reporting.metrics.contact import PERSONS, SHOWN_PARTS, method_prefixes
 from hrcreplay.reporting.metrics.fusion import add_limbs
 from hrcreplay.reporting.metrics.series import Metric, MetricTable
@@ -51,7 +51,7 @@ def verdict(run: Run, metrics: Metrics) -> ContactSummary | None:
     if run.motion is None or metrics["contact_person"]["value"] is None:
         return None
     return ContactSummary(
-        (_contact(metrics), _cost_in_short(run, metrics)),
+        (*_as_it_ran(run, metrics), _contact(metrics), _cost_in_short(run, metrics)),
         _speeds(run, metrics),
         scope(metrics),
         _held(metrics),
@@ -299,18 +299,70 @@ def _table(run: Run, metrics: Metrics) -> PageTable:
         speeds = [text_of(metrics[f"{near}_{of}_speed_m_per_s"]) for of in ("contact", "tcp")]
         rows.append(
             (
-                method + (" (this plan)" if prefix == "plan" else "") + (" (run blind)" if method == "none" else ""),
+                method + _ROLES.get(prefix, "") + (" (run blind)" if method == "none" else ""),
                 _ticks(metrics[f"{prefix}_touch_moving_ticks"]),
                 text_of(metrics[f"{prefix}_touch_contact_speed_max_m_per_s"]),
                 _signed(metrics[f"{near}_m"]),
                 " / ".join(speed.removesuffix(" m/s") for speed in speeds) + (" m/s" if "m/s" in speeds[0] else ""),
                 _signed(metrics[f"{prefix}_body_distance_min_rest_m"]),
-                percent(metrics[f"{prefix}_progress_share"]),
-                percent(metrics[f"{prefix}_stationary_share"]),
-                percent(metrics[f"{prefix}_full_stop_share"]),
+                percent(metrics.get(f"{prefix}_progress_share")),
+                percent(metrics.get(f"{prefix}_stationary_share")),
+                percent(metrics.get(f"{prefix}_full_stop_share")),
             )
         )
     return PageTable("Robot against everybody recorded", _COLUMNS, tuple(rows), _note(run, metrics))
+
+
+#: Prefix of the metrics of a method -> its role, behind its name.
+_ROLES = {"plan": " (this plan)", RECORDED: " (as it ran)"}
+
+
+def _as_it_ran(run: Run, metrics: Metrics) -> tuple[str, ...]:
+    """Returns the answer for the robot as recorded in short; none without its joints."""
+    return () if run.recorded is None else answer_as_it_ran(metrics)[:1]
+
+
+def answer_as_it_ran(metrics: Metrics) -> tuple[str, str]:
+    """Answers if the robot was safe as it ran: the short answer, and what it covers.
+
+    Args:
+        metrics: Metrics of a run with the robot as recorded.
+    """
+    touch, near = metrics["recorded_touch_moving_ticks"], metrics["recorded_body_distance_min_moving_m"]["value"]
+    if touch["value"] is None:
+        short = "It is not known whether the robot touched anybody as it ran."
+    elif touch["value"]:
+        seconds, speed = (text_of(metrics[f"recorded_touch_{w}"]) for w in ("moving_s", "contact_speed_max_m_per_s"))
+        short = f"As it ran, the moving robot touched {_whom(metrics, RECORDED)}: {seconds}, up to {speed}."
+    elif near is None:
+        short = "As it ran, the robot did not move while anybody was known to be there."
+    else:
+        seen = _as_far_as(metrics)
+        short = f"As it ran{seen} the moving robot touched nobody: it kept {_centimetres(near)} away or more."
+    both, ticks = metrics["recorded_body_known_ticks"], metrics["recorded_ticks"]
+    judge = metrics["contact_person"]["value"]
+    words = [f"Robot and person are both known at {text_of(both)} of {text_of(ticks)} ticks, judged by the {judge}."]
+    if both["value"] != ticks["value"]:
+        words.append("The others were not looked at.")
+    unknown = {
+        n.removeprefix(_UNKNOWN): m["value"] for n, m in metrics.items() if n.startswith(_UNKNOWN) and m["value"]
+    }
+    if unknown:
+        parts = ", ".join(f"{reason.replace('_', ' ')} {count:,}" for reason, count in unknown.items())
+        words.append(f"The robot is not known at {_count(sum(unknown.values()))}: {parts}.")
+    if rest := metrics["recorded_touch_rest_ticks"]["value"]:
+        words.append(f"At rest it was in contact at {_count(rest)}.")
+    if moving := metrics["recorded_moving_ticks"]["value"]:
+        late = metrics["recorded_contact_moving_ticks"]["value"]
+        words.append(
+            f"At {late:,} of its {_count(moving)} in motion a link was where the person was predicted to reach before "
+            "it could have stopped.".replace(",", "\u202f")
+        )
+    return short, " ".join(words)
+
+
+#: Prefix of the numbers of ticks at which the robot is not known, before the reason.
+_UNKNOWN = "recorded_unknown_ticks_"
 
 
 def _signed(metric: Metric) -> str:

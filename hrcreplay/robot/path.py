@@ -269,17 +269,7 @@ def smooth_recorded(t_ns: Ints, q: Floats, model: RobotModel) -> Reference:
     """
     from scipy.signal import savgol_filter  # the import takes 1 s; few logs have a joint track
 
-    if q.ndim != 2 or q.shape[1] != model.nv:
-        raise LogError(f"joint track: found {q.shape[-1]} joints; {model.name} has {model.nv} axes")
-    whole = np.isfinite(q).all(axis=1)
-    instants, first = np.unique(t_ns[whole], return_index=True)
-    if len(instants) < 2:
-        raise LogError(f"joint track: found {len(instants)} instants with finite positions; a path needs two")
-    rows = q[whole][first]
-    endless = np.isinf(model.q_max)
-    rows[:, endless] = np.unwrap(rows[:, endless], axis=0)
-    margin = np.full(model.nv, _NOISE_RAD)
-    _check(model, instants - t_ns[0], rows, "position", "rad", (model.q_min, model.q_max, margin))
+    instants, rows = check_recorded(t_ns, q, model)
     seconds = (instants - instants[0]) * 1e-9
     grid = np.arange(max(2, math.ceil(seconds[-1] / STEP_S) + 1)) * STEP_S
     even = np.column_stack([np.interp(grid, seconds, rows[:, axis]) for axis in range(model.nv)])
@@ -294,6 +284,35 @@ def smooth_recorded(t_ns: Ints, q: Floats, model: RobotModel) -> Reference:
     _check(model, grid * 1e9, dq, "speed", "rad/s", (-model.dq_max, model.dq_max, _NOISE_SPEED * model.dq_max))
     fastest = max(float(model.pose(*row).tcp_speed(row[1])) for row in zip(smooth, dq, strict=True))
     return _by_itself(model, smooth, dq, (), fastest)
+
+
+def check_recorded(t_ns: Ints, q: Floats, model: RobotModel) -> tuple[Ints, Floats]:
+    """Checks a recorded joint track against the range of the robot's axes.
+
+    Args:
+        t_ns: (n,) instants, in any order [ns].
+        q: (n, nv) [rad]; rows that are not finite are left out.
+        model: The robot.
+
+    Returns:
+        (m,) instants, increasing [ns], and (m, nv) positions, of endless axes without jumps by full turns [rad].
+
+    Raises:
+        LogError: The number of axes differs, there are too few rows, or a position is more than one degree outside the
+            range of its axis.
+    """
+    if q.ndim != 2 or q.shape[1] != model.nv:
+        raise LogError(f"joint track: found {q.shape[-1]} joints; {model.name} has {model.nv} axes")
+    whole = np.isfinite(q).all(axis=1)
+    instants, first = np.unique(t_ns[whole], return_index=True)
+    if len(instants) < 2:
+        raise LogError(f"joint track: found {len(instants)} instants with finite positions; a path needs two")
+    rows = q[whole][first]
+    endless = np.isinf(model.q_max)
+    rows[:, endless] = np.unwrap(rows[:, endless], axis=0)
+    margin = np.full(model.nv, _NOISE_RAD)
+    _check(model, instants - t_ns[0], rows, "position", "rad", (model.q_min, model.q_max, margin))
+    return instants, rows
 
 
 #: Number of points of an approach at which the TCP speed is computed, each with the largest speed of the profile.

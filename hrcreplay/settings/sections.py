@@ -349,6 +349,9 @@ class Plan(Section):
     """ssm: speed at which a person may approach, ISO 13855 [m/s]."""
     task: Path | None = None
     """Task file (TOML); none: the task in the log, else the joint track in the log."""
+    waiting_s: Positive | Literal["keep"] = 0.5
+    """Programme from recorded joints: a standstill of at least this time in the middle of a move counts as waiting of
+    the recorded robot's own safety function and is cut from the programme; keep: none is cut [s]."""
     reference: Literal["time", "path"] = "path"
     """time: the reference advances with the clock; path: only as far as the robot has followed."""
     max_reference_lead_m: Positive = 0.4

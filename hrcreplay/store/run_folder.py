@@ -25,7 +25,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from hrcreplay.errors import SettingsError
-from hrcreplay.records import Floats
+from hrcreplay.records import RECORDED, Floats
 
 #: The outputs that may differ between two runs on the same log and settings.
 NOT_DETERMINISTIC = frozenset({"run.json", "timing.json"})
@@ -184,6 +184,7 @@ class Run:
     motion: pd.DataFrame | None = None
     contact: pd.DataFrame | None = None
     body: pd.DataFrame | None = None
+    recorded: pd.DataFrame | None = None  #: motion of the robot as recorded
     baselines: dict[str, pd.DataFrame] = field(default_factory=dict)
     counts: dict[str, int] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
@@ -242,7 +243,7 @@ def read(folder: Path, meta: dict[str, Any] | None = None, *, shown: bool = Fals
         pa.default_memory_pool().release_unused()
         return found
 
-    baselines = sorted(p.stem.removeprefix("motion_") for p in folder.glob("motion_*.parquet"))
+    baselines = sorted({p.stem.removeprefix("motion_") for p in folder.glob("motion_*.parquet")} - {RECORDED})
     return Run(
         folder=folder,
         meta=meta,
@@ -255,6 +256,7 @@ def read(folder: Path, meta: dict[str, Any] | None = None, *, shown: bool = Fals
         motion=table("motion"),
         contact=table("contact"),
         body=table("body"),
+        recorded=table(f"motion_{RECORDED}"),
         baselines={name: found for name in baselines if (found := table(f"motion_{name}")) is not None},
         counts=meta.get("counts", {}),
         notes=tuple(meta.get("notes", ())),

@@ -233,7 +233,7 @@ def run_config_of(start: dict[str, Any], log: Path, log_sha256: str) -> RunConfi
 def _setup(run_config: RunConfig, scene: HeaderOnlyLog, *, sending: bool) -> ControlSetup:
     live, plan = run_config.settings.live, run_config.settings.plan
     robot = assembly.robot(run_config, assembly.robot_base(run_config, scene))
-    programme, _ = assembly.reference(run_config, scene, robot)
+    programme = assembly.programme(run_config, scene, robot).path
     settings = assembly.plan_settings(run_config, live.cycle_s, plan.method)
 
     def follow(path: Reference, s_s: float) -> Controller:

@@ -11,8 +11,8 @@ import numpy as np
 import pandas as pd
 
 from hrcreplay.evaluation.contact import deciding_rows
-from hrcreplay.records import Bools, Floats, Ints
-from hrcreplay.reporting.metrics.planning import is_moving, numeric_column
+from hrcreplay.records import RECORDED, UNGUARDED, Bools, Floats, Ints
+from hrcreplay.reporting.metrics.planning import is_moving, method_text, numeric_column
 from hrcreplay.reporting.metrics.series import MetricTable, durations_s, times, true_runs
 from hrcreplay.settings.sections import setting
 from hrcreplay.store.run_folder import Run
@@ -34,12 +34,19 @@ SHOWN_PARTS = {
 
 
 def method_prefixes(run: Run) -> dict[str, str]:
-    """Method -> prefix of its metrics; the run's own first, ``none`` last."""
+    """Method -> prefix of its metrics; the robot as recorded first, then the run's own method, ``none`` last."""
     own = str(setting(run.meta.get("settings", {}), "plan", "method"))
     return {
+        **({} if run.recorded is None else {RECORDED: RECORDED}),
         own: "plan",
         **{name: f"baseline_{name}" for name in sorted(run.baselines, key=lambda name: (name == "none", name))},
     }
+
+
+def motion_of(run: Run, prefix: str) -> pd.DataFrame:
+    """Returns the table of motion of a method, by the prefix of its metrics."""
+    found = {"plan": run.motion, RECORDED: run.recorded}.get(prefix)
+    return run.baselines[prefix.removeprefix("baseline_")] if found is None else found
 
 
 def add_contact(metrics: MetricTable, run: Run, slow_m_per_s: float) -> None:
@@ -63,14 +70,16 @@ def add_contact(metrics: MetricTable, run: Run, slow_m_per_s: float) -> None:
     if run.motion is None:
         return
     for method, prefix in method_prefixes(run).items():
-        what = "the plan" if prefix == "plan" else f"the baseline '{method}'"
-        motion = run.motion if prefix == "plan" else run.baselines[method]
-        _add_stops(metrics, prefix, motion, what, slow_m_per_s)
+        what = method_text(prefix)
+        motion = motion_of(run, prefix)
+        if prefix != RECORDED:
+            _add_stops(metrics, prefix, motion, what, slow_m_per_s)
         if run.contact is not None:
             rows = run.contact[run.contact["method"] == method]
             _add_touch(metrics, prefix, rows, what)
             _add_nearest(metrics, prefix, rows, what)
-            _add_faults(metrics, prefix, rows, what, motion, blind=method == "none")
+            if prefix != RECORDED:
+                _add_faults(metrics, prefix, rows, what, motion, blind=method in UNGUARDED)
     if run.contact is not None:
         _add_left(metrics, run.contact)
 

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from hrcreplay.records import STATUSES, Bools, Floats, Ints
+from hrcreplay.records import RECORDED, STATUSES, Bools, Floats, Ints
 from hrcreplay.reporting.metrics.series import MetricTable, durations_s, path_feet, times
+from hrcreplay.robot.recorded import UNKNOWN
 
 #: Shorter distances are rounding [m].
 _ROUNDING_M = 1e-9
@@ -186,6 +187,7 @@ def add_plan(
     stationary_m_per_s: float,
     max_reference_lead_m: float,
     contact: pd.DataFrame | None = None,
+    recorded: pd.DataFrame | None = None,
 ) -> None:
     """Adds all metrics of the motion and of the baselines, and the paper's own figures.
 
@@ -198,14 +200,17 @@ def add_plan(
         stationary_m_per_s: A TCP slower than this counts as stationary [m/s].
         max_reference_lead_m: Distance of the TCP at which the reference waits [m].
         contact: Rows of contact.parquet; None without a comparison with the recorded body.
+        recorded: Rows of motion_recorded.parquet; None without joints of the robot in the log.
     """
     if motion is None:
         metrics.add("plan_method", None, "name", "method of the plan", reason="not planned")
     else:
         metrics.add("plan_method", method, "name", "method of the plan; baselines ran on the same volumes")
+    if recorded is not None:
+        _add_recorded(metrics, recorded, contact, near_m, stationary_m_per_s)
     tables = {} if motion is None else {"plan": motion, **{f"baseline_{name}": baselines[name] for name in baselines}}
     for prefix, table in tables.items():
-        what = "the plan" if prefix == "plan" else f"the baseline '{prefix.removeprefix('baseline_')}'"
+        what = method_text(prefix)
         _add_status(metrics, prefix, table, what, stationary_m_per_s)
         _add_separation(metrics, prefix, table, what, stationary_m_per_s)
         _add_stationary(metrics, prefix, table, what, near_m, stationary_m_per_s)
@@ -216,6 +221,46 @@ def add_plan(
         _add_fastest(metrics, prefix, table, rows, what, near_m)
     for name, (value, unit, meaning) in PAPER.items():
         metrics.add(name, value, unit, meaning)
+
+
+def method_text(prefix: str) -> str:
+    """Describes a method in the meanings of its metrics, by their prefix."""
+    if prefix == RECORDED:
+        return "the robot as recorded"
+    return "the plan" if prefix == "plan" else f"the baseline '{prefix.removeprefix('baseline_')}'"
+
+
+def _add_recorded(
+    metrics: MetricTable, motion: pd.DataFrame, contact: pd.DataFrame | None, near_m: float, slow: float
+) -> None:
+    """Adds the metrics of the robot as recorded: of its known ticks only, and their number."""
+    what, known = method_text(RECORDED), np.isfinite(numeric_column(motion, "q1"))
+    metrics.add("recorded_ticks", len(motion), "1", f"ticks of {what}, known or not")
+    metrics.add("recorded_known_ticks", int(known.sum()), "1", f"ticks of {what} at which all its joints are known")
+    reasons = motion["reason"].astype(str).to_numpy()
+    for reason in UNKNOWN[1:]:
+        count = int((reasons[~known] == reason).sum())
+        metrics.add(
+            f"recorded_unknown_ticks_{_slug(reason)}", count, "1", f"ticks of {what} that are not known: {reason}"
+        )
+    moving = is_moving(motion, slow)
+    metrics.add("recorded_moving_ticks", int(moving.sum()), "1", f"ticks of {what} at which it moves")
+    within = numeric_column(motion, "distance_m") <= 0.0
+    metrics.add(
+        "recorded_contact_moving_ticks",
+        int((within & moving).sum()),
+        "1",
+        f"ticks of {what} at which it moves with a link in a place that the person was predicted to reach before it "
+        "could have stopped",
+    )
+    _add_separation(metrics, RECORDED, motion, what, slow)
+    rows = None if contact is None else contact[contact["method"] == RECORDED]
+    _add_fastest(metrics, RECORDED, motion, rows, what, near_m)
+
+
+def _slug(reason: str) -> str:
+    """Returns a reason as part of a metric's name."""
+    return "_".join("".join(c if c.isalnum() else " " for c in reason.lower()).split())
 
 
 def _add_status(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: str, slow: float) -> None:
@@ -238,7 +283,7 @@ def _add_status(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: s
     reasons = motion["reason"].astype(str).to_numpy()
     for reason in sorted(set(reasons[braking])):
         count = int((reasons[braking] == reason).sum())
-        slug = "_".join("".join(c if c.isalnum() else " " for c in reason.lower()).split()) or "unnamed"
+        slug = _slug(reason) or "unnamed"
         because = f"ticks of {what} that braked because: {reason}"
         metrics.add(f"{prefix}_braking_ticks_{slug}", count, "1", because)
         metrics.add(f"{prefix}_braking_share_{slug}", count / len(motion), "1", f"share of all {because}")

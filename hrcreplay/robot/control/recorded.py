@@ -1,0 +1,85 @@
+"""The motion of the robot as recorded, beside the person. It is no controller: it proposes and certifies nothing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hrcreplay.records import Floats, Ints, Motion, MotionRow
+from hrcreplay.robot.control.control_step import REASONS, PlanSettings, RobotState, observe, stop_straight
+from hrcreplay.robot.control.controllers import Predict
+from hrcreplay.robot.model import RobotModel
+from hrcreplay.robot.recorded import UNKNOWN, RecordedJoints
+
+
+@dataclass(frozen=True)
+class RecordedMotion:
+    """Gives the recorded motion, tick by tick, in the form of a controller's."""
+
+    robot: RobotModel
+    joints: RecordedJoints
+    settings: PlanSettings
+    chosen: bool = False  #: it is never the run's method
+
+    def follow(self, t_ns: Ints, around: Sequence[Predict], limbs: tuple[str, ...]) -> Motion:
+        """The recorded motion at a batch of ticks.
+
+        The distance is that from the volumes until the robot could have stopped: from the velocity of the tick, with
+        the axes' limits, after the latency. A tick at which the joints are not known has no number but a reason.
+
+        Args:
+            t_ns: (n,) ticks [ns].
+            around: Volumes of each tick for any horizon.
+            limbs: Names of all possible volumes.
+        """
+        sample = self.joints.sample(t_ns)
+        rows = [
+            self._without_numbers(UNKNOWN[reason]) if reason else self._row(q, dq, predict)
+            for q, dq, reason, predict in zip(sample.q, sample.dq, sample.reason.tolist(), around, strict=True)
+        ]
+        links = tuple(segment.name for segment in self.robot.segments)
+        return Motion.of_rows(t_ns, rows, limbs=limbs, links=links, reasons=(*REASONS, *UNKNOWN[1:]))
+
+    def _row(self, q: Floats, dq: Floats, predict: Predict) -> MotionRow:
+        """The row of a tick with known joints."""
+        stop = stop_straight(q, dq, self.robot.ddq_max, self.settings.dt_s)
+        horizon_s = self.settings.horizon_s(stop)
+        sight = observe(self.robot, RobotState(q, dq), predict(horizon_s), self.settings.plan.clearance_m)
+        return self._without_numbers(REASONS[sight.reason])._replace(
+            q=q,
+            dq=dq,
+            tcp_m=sight.pose.T_world_tcp[:3, 3],
+            tcp_speed=sight.pose.tcp_speed(dq),
+            distance_m=sight.distance_m,
+            overlap_m=math.nan if math.isnan(sight.distance_m) else sight.overlap_m,
+            limb=sight.limb,
+            link=sight.link,
+            horizon_s=horizon_s,
+            tau_s=stop.ticks * self.settings.dt_s,
+        )
+
+    def _without_numbers(self, reason: str) -> MotionRow:
+        """The row of a tick without any number."""
+        axes, point = np.full(self.robot.nv, math.nan), np.full(3, math.nan)
+        return MotionRow(
+            q=axes,
+            dq=axes,
+            u=axes,
+            ref_m=point,
+            tcp_m=point,
+            tcp_speed=math.nan,
+            ref_speed=math.nan,
+            programme_s=math.nan,
+            distance_m=math.nan,
+            overlap_m=math.nan,
+            limb=-1,
+            link=-1,
+            status=-1,
+            reason=reason,
+            horizon_s=math.nan,
+            tau_s=math.nan,
+            certified=False,
+        )
