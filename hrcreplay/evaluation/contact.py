@@ -258,9 +258,10 @@ def _join(batches: Sequence[Nearest]) -> Nearest:
 
 
 def _is_turning(motion: pd.DataFrame) -> Bools:
-    """(n,) True if any axis turns."""
+    """(n,) True if any axis turns; False where its velocity is not known."""
     joints = [name for name in motion.columns if name[:2] == "dq" and name[2:].isdigit()]
-    return np.asarray((motion[joints].to_numpy(dtype=float) != 0.0).any(axis=1))
+    dq = motion[joints].to_numpy(dtype=float)
+    return np.asarray((np.isfinite(dq) & (dq != 0.0)).any(axis=1))
 
 
 def _at(from_ns: Ints, motion_ns: Ints, values: Floats) -> Floats:

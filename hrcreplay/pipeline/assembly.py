@@ -360,7 +360,7 @@ def _robot(settings: Robot, files: UrdfFiles | None, stop_s: float, T_world_base
 
 
 @dataclass(frozen=True)
-class Programme:
+class RunProgramme:
     """The programmed path of a run, and the robot as recorded."""
 
     path: Reference
@@ -376,7 +376,7 @@ class Programme:
         return (start_ns - self.begin_ns - time_cut_ns(self.cuts_ns, start_ns)) / 1e9
 
 
-def programme(run_config: RunConfig, log: LogLike, model: RobotModel) -> Programme:
+def programme(run_config: RunConfig, log: LogLike, model: RobotModel) -> RunProgramme:
     """Makes the programmed path: from the task file, else the log's task, else the log's joint track.
 
     With a task, joints of the log that do not fit the robot give a note.
@@ -392,7 +392,7 @@ def programme(run_config: RunConfig, log: LogLike, model: RobotModel) -> Program
         parts = run_config.settings.robot, run_config.urdf, run_config.settings.prediction.stop_s
         path = _programme(parse_task(table, where), where, *parts, model.T_world_base.tobytes())
         recorded, notes = _recorded_beside_task(log, model)
-        return Programme(replace(path, model=model), notes, recorded=recorded)
+        return RunProgramme(replace(path, model=model), notes, recorded=recorded)
     track = log.joints(model.joint_names)
     if track is None:
         empty = f" ({', '.join(log.header.joint_topics)}: no positions that go with their names)"
@@ -405,7 +405,7 @@ def programme(run_config: RunConfig, log: LogLike, model: RobotModel) -> Program
     path = smooth_recorded(*recorded.without(cuts_ns), model)
     waiting = [] if least_s == "keep" else waiting_remarks(cuts_ns, begin_ns, least_s)
     notes = (*log.joint_notes, *waiting, *recorded_remarks(path))
-    return Programme(path, notes, begin_ns, cuts_ns, recorded)
+    return RunProgramme(path, notes, begin_ns, cuts_ns, recorded)
 
 
 def _recorded(track: JointTrack, model: RobotModel) -> RecordedJoints:
@@ -438,7 +438,7 @@ def _programme(
     return plan_programme(task, model, where)
 
 
-def planners(run_config: RunConfig, given: Programme, start_ns: int) -> dict[str, Planner]:
+def planners(run_config: RunConfig, given: RunProgramme, start_ns: int) -> dict[str, Planner]:
     """Makes stage 3: the chosen method and its baselines, each with its own robot."""
     plan, dt_s, s_s = run_config.settings.plan, 1.0 / run_config.settings.fusion.rate_hz, given.start_s(start_ns)
 
@@ -455,7 +455,7 @@ def recorded_motion(run_config: RunConfig, model: RobotModel, joints: RecordedJo
     return RecordedMotion(model, joints, settings)
 
 
-def followers(run_config: RunConfig, given: Programme, start_ns: int) -> dict[str, Planner | RecordedMotion]:
+def followers(run_config: RunConfig, given: RunProgramme, start_ns: int) -> dict[str, Planner | RecordedMotion]:
     """Makes all motions of a run: the chosen method, its baselines and, with joints in the log, the recorded robot."""
     found: dict[str, Planner | RecordedMotion] = {**planners(run_config, given, start_ns)}
     if given.recorded is not None:

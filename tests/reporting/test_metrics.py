@@ -193,7 +193,7 @@ def test_the_greatest_speeds_at_all_and_near_the_body(run: Run) -> None:
     )
     metrics = MetricTable()
     bounds = {"near_m": 0.5, "stationary_m_per_s": 0.001, "max_reference_lead_m": 0.4}
-    add_plan(metrics, motion, {"scaling": motion}, method="qp", contact=rows, **bounds)
+    add_plan(metrics, motion, {"scaling": motion}, method="qp", contact=rows, recorded=None, **bounds)
     found = metrics.sorted()
     assert found["plan_tcp_speed_max_m_per_s"]["value"] == 1.4
     assert found["plan_ref_speed_max_m_per_s"]["value"] == 0.7

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from hrcreplay.records import STATUSES, Bools, Floats
+from hrcreplay.records import RECORDED, STATUSES, Bools, Floats
 from hrcreplay.reporting.figures import drawing
 from hrcreplay.reporting.figures.prediction import Limbs, stored_at
 from hrcreplay.reporting.figures.scene import ABOVE, View, bounds_of, draw_outlines, view_from
@@ -337,6 +337,7 @@ _COLOURS = {
     "shield": drawing.GREEN,
     "ssm": drawing.PURPLE,
     "none": drawing.VERMILLION,
+    RECORDED: drawing.INK,
 }
 _MARKERS = {"sound": "o", "paper": "s", "positions": "D"}
 
@@ -356,12 +357,15 @@ def methods(found: Mapping[str, Any]) -> Figure:
         for other in alone:
             ax.plot(*_place(other), ".", ms=5, color=colour, alpha=0.45)
         words = label.replace(":", ", ") + (f": {row['stillness']}" if row["stillness"] else "")
+        if row["touch_ticks"]:
+            words += f": {row['touch_ticks']:,} ticks in contact,\nup to {row['touch_speed_m_per_s']:.2f} m/s"
+        if of["method"] == RECORDED and row["nearest_moving_m"] is not None:  # its programme, so its pace, is not known
+            ax.axhline(100.0 * row["nearest_moving_m"], color=colour, lw=1.2, ls=(0, (4, 3)), label=words)
+            continue
         if row["pace"] is None or row["nearest_moving_m"] is None:
             if row["stillness"]:  # it has no position in the plot but is listed
                 ax.plot([], [], "x", ms=8, color=colour, label=words)
             continue
-        if row["touch_ticks"]:
-            words += f": {row['touch_ticks']:,} ticks in contact,\nup to {row['touch_speed_m_per_s']:.2f} m/s"
         face = "white" if of.get("horizon") == "fixed" else colour
         ax.plot(
             *_place(row), marker, ms=8, mfc=face, mec=colour, mew=1.6, alpha=0.9, zorder=3, label=words, clip_on=False
@@ -386,7 +390,7 @@ def methods(found: Mapping[str, Any]) -> Figure:
 
 def log_rows(found: Mapping[str, Any], label: str) -> list[Mapping[str, Any]]:
     """Returns the figures of a method on each log that can be plotted."""
-    rows = [log["methods"][label] for log in found["logs"]]
+    rows = [log["methods"][label] for log in found["logs"] if label in log["methods"]]
     return [row for row in rows if row["pace"] is not None and row["nearest_moving_m"] is not None]
 
 

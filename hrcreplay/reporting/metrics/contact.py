@@ -95,7 +95,7 @@ def _add_people(metrics: MetricTable, run: Run) -> None:
     )
     metrics.add(
         "programme_gaps_s",
-        run.counts.get("joint_gaps_ms", 0) * 1e-3,
+        0.0 if run.meta.get("programme") == "task" else run.counts.get("joint_gaps_ms", 0) * 1e-3,
         "s",
         "of the programme, where that is the recorded robot's motion: a straight line over gaps in its joints",
     )
