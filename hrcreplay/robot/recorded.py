@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hrcreplay.records import Bools, Floats, Ints, Table
+from hrcreplay.records import Bools, Floats, Ints, Table, find_neighbours
 
 #: A robot stands if no axis moves further than this [rad] within this time around an instant [s].
 REST_RAD, REST_S = 1e-3, 0.1
@@ -81,10 +81,10 @@ class RecordedJoints(Table):
 
     def _linear(self, values: Floats, at_ns: Ints) -> Floats:
         """(m, nv) between the two rows around each instant; at the instant of a row, that row."""
-        row = np.clip(np.searchsorted(self.t_ns, at_ns, side="right") - 1, 0, len(self.t_ns) - 1)
-        after = np.minimum(row + 1, len(self.t_ns) - 1)
-        share = ((at_ns - self.t_ns[row]) / np.maximum(self.t_ns[after] - self.t_ns[row], 1))[:, None]
-        return np.where(share == 0.0, values[row], values[row] + share * (values[after] - values[row]))
+        row, after, share, _ = find_neighbours(self.t_ns, at_ns)
+        return np.where(
+            row[:, None] == after[:, None], values[row], values[row] + share[:, None] * (values[after] - values[row])
+        )
 
     def _slope(self, at_ns: Ints, first: Ints, last: Ints) -> Floats:
         """(m, nv) mean velocity around each instant, within its stretch [rad/s]."""
