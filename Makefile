@@ -4,24 +4,28 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --quiet --disable-pip-version-check
 
-.PHONY: demo check test docs bench soundness fuzz readme picture people deviations lock clean
+.PHONY: demo check test lint types quick docs bench soundness fuzz readme picture people deviations lock clean
 
 demo: $(VENV)/made
 	@$(BIN)/hrcreplay demo
 
 # By two processes, for two cores; see tests/conftest.py.
 PROCESSES ?= 2
-test: $(VENV)/made
-	$(BIN)/ruff format --check .
-	$(BIN)/ruff check .
-	$(BIN)/mypy
+test: lint types
 	$(BIN)/pytest --numprocesses $(PROCESSES)
 
-# Format, lint, types and the quick tests, which tests/conftest.py lists.
-check: $(VENV)/made
+# Format, lint, types and the quick tests, which tests/conftest.py lists; types and tests at the same time.
+check: lint
+	@$(MAKE) --no-print-directory --jobs 2 types quick
+
+lint: $(VENV)/made
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
+
+types: $(VENV)/made
 	$(BIN)/mypy
+
+quick: $(VENV)/made
 	$(BIN)/pytest --quick --numprocesses $(PROCESSES)
 
 # The documentation as a site that needs no network, with a search and the API; see mkdocs.yml. Prints the page to open.
