@@ -14,6 +14,7 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag
 
+from hrcreplay.calibration.cell_objects import MOST_OBJECTS, SHAPES, CellObject, read_objects
 from hrcreplay.calibration.registration import rigid
 from hrcreplay.errors import shown
 from hrcreplay.geometry.polygon import ConvexPolygon
@@ -82,6 +83,7 @@ class Cell:
     clock_offset_s: Mapping[str, float] = field(default_factory=dict)  #: camera's clock minus the reference camera's
     T_world_base: Floats | None = None  #: (4, 4) robot base
     watched: Watched | None = None  #: area in which every person is seen by a camera
+    objects: tuple[CellObject, ...] = ()  #: what stands in the cell
     residuals: tuple[Residual, ...] = ()
     notes: tuple[str, ...] = ()  #: uncertain results of calibrate
 
@@ -97,6 +99,8 @@ class Cell:
             cell["T_world_base"] = self.T_world_base.tolist()
         if self.watched is not None:
             cell["watched"] = self.watched.model_dump()
+        if self.objects:
+            cell["objects"] = [one.to_dict() for one in self.objects]
         if self.residuals:
             cell["residuals"] = [residual.model_dump() for residual in self.residuals]
         if self.notes:
@@ -104,8 +108,13 @@ class Cell:
         return cell
 
     @classmethod
-    def from_dict(cls, table: Mapping[str, Any], where: str = "cell") -> Self:
+    def from_dict(cls, table: Mapping[str, Any], where: str = "cell", folder: Path | None = None) -> Self:
         """Makes a cell from the result of ``to_dict`` or the content of a cell file.
+
+        Args:
+            table: The cell.
+            where: Prefix of error messages.
+            folder: Folder in which relative files of meshes are searched; None: there are none.
 
         Raises:
             SettingsError: A key or value is invalid.
@@ -119,6 +128,7 @@ class Cell:
             clock_offset_s={name: camera.clock_offset_s for name, camera in file.cameras.items()},
             T_world_base=None if base is None else np.array(base),
             watched=file.watched,
+            objects=read_objects(file.objects, where, folder),
             residuals=tuple(file.residuals),
             notes=tuple(file.notes),
         )
@@ -130,7 +140,7 @@ def load_cell(path: Path) -> Cell:
     Raises:
         SettingsError: The file cannot be read, or a key or value is invalid.
     """
-    return Cell.from_dict(read_toml(path, "name a cell file"), str(path))
+    return Cell.from_dict(read_toml(path, "name a cell file"), str(path), path.parent)
 
 
 def write_cell(cell: Cell, path: Path) -> None:
@@ -169,6 +179,9 @@ def _toml(cell: Cell) -> str:
         text += [f"clock_offset_s = {entry['clock_offset_s']!r}"]
     if "watched" in table:
         text += ["", "[watched]", *(f"{key} = {value!r}" for key, value in table["watched"].items())]
+    for one in table.get("objects", []):
+        text += ["", "[[objects]]"]
+        text += [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in one.items()]
     for residual in table.get("residuals", []):
         text += ["", "[[residuals]]"]
         text += [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in residual.items()]
@@ -227,6 +240,7 @@ class _CellFile(BaseModel):
     cameras: dict[str, _Camera] = {}
     T_world_base: _Base | None = None
     watched: Watched | None = None
+    objects: Annotated[list[CellObject], Field(max_length=MOST_OBJECTS)] = []
     residuals: list[Residual] = []
     notes: list[str] = []
 
@@ -242,6 +256,9 @@ _RIGHT = {
     "margin_m": "a distance of 0 or more [m]",
     "clear_s": "a time of 0 or more [s]",
     "speed_m_per_s": "a speed above 0 [m/s]",
+    "objects": f"up to {MOST_OBJECTS} tables [[objects]]",
+    "shape": f"one of {', '.join(SHAPES)}",
+    "name": "a short text",
     "residuals": f"tables with {', '.join(Residual.model_fields)}",
     "notes": "a list of texts",
 }

@@ -408,8 +408,8 @@ def demo(
     """Report on the log that ships with hrcreplay: a worker beside a pick-and-place robot, two cameras, 60 s."""
     from hrcreplay.commands import replay
 
-    overrides = as_overrides(settings)
-    folder = _run("report", replay.demo_log(), out=out, config=config, overrides=overrides, chunk_ticks=chunk_ticks)
+    cell, how = replay.demo_cell(), {"config": config, "overrides": as_overrides(settings)}
+    folder = _run("report", replay.demo_log(), cell_file=cell, out=out, chunk_ticks=chunk_ticks, **how)
     sys.stdout.write(f"{folder / 'report.html'}\n")
 
 

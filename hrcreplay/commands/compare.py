@@ -285,8 +285,11 @@ def _notes(
 def _programme(run_config: RunConfig, log: Log, start_ns: int) -> tuple[PlacedProgramme, tuple[str, ...]]:
     """Returns the programme of a log, and remarks on it."""
     base = assembly.robot_base(run_config, log)
-    found = assembly.programme(run_config, log, assembly.robot(run_config, base))
-    return PlacedProgramme(base, found.path, found.start_s(start_ns), found.recorded), found.notes
+    robot = assembly.robot(run_config, base)
+    found = assembly.programme(run_config, log, robot)
+    static = assembly.static_scene(run_config, robot, found.path, found.start_s(start_ns))
+    notes = (*found.notes, *(() if static is None else static.notes))
+    return PlacedProgramme(base, found.path, found.start_s(start_ns), found.recorded), notes
 
 
 def _as_recorded(run_config: RunConfig) -> Variant:
@@ -413,7 +416,7 @@ def plan(task: VariantTask, progress: Callable[[int], None] | None = None) -> tu
             forecast = Forecast(surroundings, batch)
             around = [forecast.predict(tick) for tick in range(len(batch))]
             made = planner.follow(batch.t_ns, around, surroundings.names)
-            writer.table(f"motion_{slug}", motion_columns(made))
+            writer.table(f"motion_{slug}", motion_columns(made) | stages.nearest_columns(planner, made))
         done += len(batch)
         if progress is not None:
             progress(len(batch))
@@ -432,10 +435,12 @@ def _planner(task: VariantTask, robot: RobotModel) -> Planner | RecordedMotion:
     """Makes the controller of the variant at the start of the programme, or the recorded motion."""
     run_config, programme = task.run_config, task.programme
     if task.variant.method == RECORDED and programme.recorded is not None:
-        return assembly.recorded_motion(run_config, robot, programme.recorded)
+        static = assembly.static_scene(run_config, robot, replace(programme.path, model=robot), programme.start_s)
+        return assembly.recorded_motion(run_config, robot, programme.recorded, static)
     settings = assembly.plan_settings(run_config, 1.0 / run_config.settings.fusion.rate_hz, task.variant.method)
     path = replace(programme.path, model=robot)
-    controller = assembly.make_controller(task.variant.method, robot, path, settings, programme.start_s)
+    static = assembly.static_scene(run_config, robot, path, programme.start_s)
+    controller = assembly.make_controller(task.variant.method, robot, path, settings, programme.start_s, static)
     return Planner(controller, chosen=True)
 
 

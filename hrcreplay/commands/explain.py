@@ -237,13 +237,26 @@ def facts(record: Record, tick: int) -> dict[str, Any] | None:
     if record.method == "none" or standstill_reason(sight, settings):
         return found
     proposals, more = propose_explained(record.controller, context)
-    found |= _named(more, links, limbs)
+    found |= _named(more, links, limbs) | _objects(record, tick)
     if isinstance(proposals, list) and settings.certified and record.motion["reason"].iloc[tick] == "not certified":
-        obstacles, horizon_s = context.seen.obstacles, context.seen.horizon_s
+        until, static = (context.seen.obstacles, context.seen.horizon_s), record.controller.static
         found["refused"] = [
-            _named(explain_refusal(robot, context.current_stop, proposal, obstacles, horizon_s, settings), links, limbs)
+            _named(explain_refusal(robot, context.current_stop, proposal, *until, settings, static), links, limbs)
             for proposal in proposals
         ]
+    return found
+
+
+def _objects(record: Record, tick: int) -> dict[str, Any]:
+    """Nearest object and nearest pair of links at a tick; nothing for a cell without objects."""
+    row = record.motion.iloc[tick]
+    found: dict[str, Any] = {}
+    if "object_distance_m" in row and np.isfinite(row["object_distance_m"]):
+        found["nearest_object"] = {"link": str(row["object_link"]), "object": str(row["object"])}
+        found["nearest_object"] |= {"distance_m": float(row["object_distance_m"])}
+    if "self_distance_m" in row and np.isfinite(row["self_distance_m"]):
+        found["nearest_links"] = {"link": str(row["self_link"]), "other_link": str(row["self_other_link"])}
+        found["nearest_links"] |= {"distance_m": float(row["self_distance_m"])}
     return found
 
 
@@ -274,8 +287,8 @@ def _named(found: dict[str, Any], links: Sequence[str], limbs: Sequence[str]) ->
     """Replaces the numbers of links and limbs by their names, at any depth."""
     named: dict[str, Any] = {}
     for key, value in found.items():
-        if key in ("link", "limb"):
-            named[key] = (links if key == "link" else limbs)[value]
+        if key in ("link", "other_link", "limb"):
+            named[key] = (limbs if key == "limb" else links)[value]
         elif isinstance(value, dict):
             named[key] = _named(value, links, limbs)
         elif isinstance(value, list) and value and isinstance(value[0], dict):
@@ -312,6 +325,8 @@ def sentences(found: Mapping[str, Any]) -> list[str]:
         lines.append(
             f"Nearest: {_pair(near)}, {apart}; volumes up to {1e3 * found['horizon_s']:.0f} ms after the tick."
         )
+    for near in (found[key] for key in ("nearest_object", "nearest_links") if key in found):
+        lines.append(f"Nearest of the cell: {_pair(near)}, {1e3 * near['distance_m']:.1f} mm.")
     lines += [f"Active row: {_row(row)}, multiplier {row['multiplier']:.3g}." for row in _weighted(found)[1:]]
     lines += [f"Limit that holds: {_row(row)}." for row in found.get("limits", ())]
     lines += [f"Next row: {_row(row)}, {1e3 * row['margin_m_per_s']:.1f} mm/s left." for row in found.get("next", ())]
@@ -370,7 +385,10 @@ def _weighted(found: Mapping[str, Any]) -> list[Mapping[str, Any]]:
 
 
 def _pair(of: Mapping[str, Any]) -> str:
-    return f"{of['link']} and {neighbour_text(of['limb'])}"
+    if "limb" in of:
+        return f"{of['link']} and {neighbour_text(of['limb'])}"
+    other = of["other_link"] if "other_link" in of else f"the object {of['object']}"
+    return f"{of['link']} and {other}"
 
 
 def _row(row: Mapping[str, Any]) -> str:
@@ -384,6 +402,8 @@ def _row(row: Mapping[str, Any]) -> str:
         return "TCP, the programme's speed limit"
     if row["kind"] == "path":
         return str(row["what"])
+    if row["kind"] in ("object", "self"):
+        return f"{_pair(row)}, {('first', 'second')[row['end']]} end of the link"
     at = ", ".join(f"{value:.3f}" for value in row["vertex_m"])
     which = ("first", "second")[row["end"]]
     return f"{_pair(row)}, {which} row of Eq. (12), vertex {row['vertex']} at ({at}) m"

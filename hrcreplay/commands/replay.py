@@ -184,6 +184,7 @@ def run_stages(
         programme = assembly.programme(run_config, log, robot)
         sink.notes["plan"].extend(programme.notes)
         moved = assembly.followers(run_config, programme, int(ticks_ns[0]))
+        sink.notes["plan"].extend(assembly.scene_notes(moved))
         every = stages.store_every(run_config) if "predict" in todo else math.inf
         flow = stages.plan_batches(states, assembly.surroundings(run_config, robot), moved, every, sink)
     elif "predict" in todo:
@@ -254,5 +255,15 @@ def _folder(run_config: RunConfig, began: datetime) -> Path:
 
 def demo_log() -> Path:
     """The log that ships with the package; in a checkout, that of datasets/."""
-    shipped = Path(str(resources.files("hrcreplay"))) / "data" / "demo.mcap"
-    return shipped if shipped.exists() else Path(__file__).parents[2] / "datasets" / "demo.mcap"
+    return _shipped("demo.mcap")
+
+
+def demo_cell() -> Path:
+    """The cell file of that log: the objects of its scene."""
+    return _shipped("demo_cell.toml")
+
+
+def _shipped(name: str) -> Path:
+    """A file that ships with the package; in a checkout, that of datasets/."""
+    path = Path(str(resources.files("hrcreplay"))) / "data" / name
+    return path if path.exists() else Path(__file__).parents[2] / "datasets" / name

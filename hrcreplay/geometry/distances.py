@@ -15,7 +15,7 @@ import numpy as np
 
 from hrcreplay.geometry.vectors import dot3
 from hrcreplay.kernels import njit
-from hrcreplay.records import Floats, Ints
+from hrcreplay.records import Bools, Floats, Ints
 
 #: A distance is proven when its bounds are this close [m].
 EXACT_M = 1e-10
@@ -193,6 +193,43 @@ def _edge(on: Carriers, i: int) -> bool:
     for c in range(3):
         e[c] /= on.triangle[i, i]
     return True
+
+
+@njit(cache=True)
+def separating_planes(ends: Floats, vertices: Floats, offsets: Ints, wanted: Bools) -> tuple[Floats, Floats]:
+    """Computes a plane between the axis of every link and every hull, orthogonal to the shortest way between them.
+
+    Args:
+        ends: (s, 2, 3) ends of the axes [m].
+        vertices: (m, 3) of all hulls [m].
+        offsets: (l + 1,) first vertex of each hull; no hull is empty.
+        wanted: (s, l) pairs to compute.
+
+    Returns:
+        Lower bound of the distance that the plane proves, (s, l), 0 in penetration and inf for pairs that are not
+        wanted [m]; and (s, l, 3) unit vectors from link to hull, zero without a plane.
+    """
+    links, hulls = len(ends), len(offsets) - 1
+    low, normals = np.full((links, hulls), np.inf), np.zeros((links, hulls, 3))
+    square = np.empty((MOST - 1, MOST - 1))
+    work = Carriers(
+        np.empty((MOST, 3)), np.empty(MOST), np.empty(MOST), np.empty((MOST - 1, 3)), square, np.empty(MOST, np.int64)
+    )
+    x = np.empty(3)
+    for s in range(links):
+        for k in range(hulls):
+            if not wanted[s, k]:
+                continue
+            low[s, k], _, count = _distance(ends[s], vertices, offsets[k], offsets[k + 1], offsets[k], work)
+            x[:] = 0.0
+            for i in range(count):
+                for c in range(3):
+                    x[c] += work.weights[i] * work.points[i, c]
+            length = math.sqrt(dot3(x, x))
+            if low[s, k] > 0.0 and length > 0.0:
+                for c in range(3):
+                    normals[s, k, c] = x[c] / length
+    return low, normals
 
 
 def protrusion_m(axes: Floats, radius_m: float, vertices: Floats, ball_m: float) -> Floats:

@@ -6,7 +6,7 @@ The packages of the stages take whole sections of the settings and plain values 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from typing import NamedTuple, Protocol
@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hrcreplay.calibration.cell import Cell
+from hrcreplay.calibration.cell_objects import CellObject
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.human.fusion import inverse_kinematics
 from hrcreplay.human.fusion.vacancy import WatchedArea
@@ -40,8 +41,10 @@ from hrcreplay.records import (
 from hrcreplay.robot.control.border import Border
 from hrcreplay.robot.control.control_step import PlanSettings
 from hrcreplay.robot.control.controllers import CONTROLLERS, Controller, Planner, Predict
+from hrcreplay.robot.control.programme_check import check_programme
 from hrcreplay.robot.control.recorded import RecordedMotion
 from hrcreplay.robot.control.separation import Obstacles, obstacles
+from hrcreplay.robot.control.static_obstacles import StaticHull, StaticObstacles, half_space
 from hrcreplay.robot.model import RobotModel, Segment, from_urdf, irb140
 from hrcreplay.robot.path import check_recorded, plan_programme, recorded_remarks, smooth_recorded
 from hrcreplay.robot.recorded import RecordedJoints, time_cut_ns, waiting_remarks
@@ -429,6 +432,41 @@ def _recorded_beside_task(log: LogLike, model: RobotModel) -> tuple[RecordedJoin
         return None, (f"the robot as recorded is not judged: {str(error).removeprefix(f'{log.header.path}: ')}",)
 
 
+def static_hulls(objects: Sequence[CellObject], model: RobotModel) -> list[StaticHull]:
+    """Returns the convex parts of a cell's objects in the world; of a half-space the part that the robot can reach."""
+    found = []
+    for one in objects:
+        T = (model.T_world_base if one.frame == "base" else np.eye(4)) @ one.T_frame_object()
+        more = (tuple(one.may_approach), one.programme_may_touch)
+        if one.normal is not None:
+            normal = T[:3, :3] @ np.array(one.normal)
+            box = half_space(model, T[:3, 3], normal / np.linalg.norm(normal))
+            found.append(StaticHull(one.name, box, 0.0, *more))
+        for points_m, radius_m in one.parts():
+            found.append(StaticHull(one.name, points_m @ T[:3, :3].T + T[:3, 3], radius_m, *more))
+    return found
+
+
+def static_scene(run_config: RunConfig, model: RobotModel, path: Reference, s_s: float) -> StaticObstacles | None:
+    """Makes what a run's robot keeps clear of beside people; None if its cell has no objects and there is no SRDF.
+
+    Args:
+        run_config: The run.
+        model: The robot.
+        path: Programmed path, which is checked.
+        s_s: Programmed time at which the robot begins [s].
+
+    Raises:
+        SettingsError: The robot begins inside an object, or its programme touches one that does not allow it.
+    """
+    objects = () if run_config.cell is None else run_config.cell.objects
+    if not objects and run_config.settings.robot.srdf is None:
+        return None
+    disabled = [frozenset(pair) for pair in run_config.disabled_pairs]
+    clearance_m = run_config.settings.plan.clearance_m
+    return check_programme(model, path, static_hulls(objects, model), clearance_m, path.sample(s_s).q, disabled)
+
+
 @lru_cache(maxsize=4)  # a live session makes its controller twice: to compile the kernels, and to run
 def _programme(
     task: Task, where: str, settings: Robot, files: UrdfFiles | None, stop_s: float, T_world_base: bytes
@@ -441,26 +479,38 @@ def _programme(
 def planners(run_config: RunConfig, given: RunProgramme, start_ns: int) -> dict[str, Planner]:
     """Makes stage 3: the chosen method and its baselines, each with its own robot."""
     plan, dt_s, s_s = run_config.settings.plan, 1.0 / run_config.settings.fusion.rate_hz, given.start_s(start_ns)
+    static = static_scene(run_config, given.path.model, given.path, s_s)
 
     def planner(name: str) -> Planner:
         settings = plan_settings(run_config, dt_s, name)
-        return Planner(make_controller(name, given.path.model, given.path, settings, s_s), chosen=name == plan.method)
+        controller = make_controller(name, given.path.model, given.path, settings, s_s, static)
+        return Planner(controller, chosen=name == plan.method)
 
     return {name: planner(name) for name in dict.fromkeys((plan.method, *plan.baselines))}
 
 
-def recorded_motion(run_config: RunConfig, model: RobotModel, joints: RecordedJoints) -> RecordedMotion:
+def recorded_motion(
+    run_config: RunConfig, model: RobotModel, joints: RecordedJoints, static: StaticObstacles | None
+) -> RecordedMotion:
     """Makes the robot as recorded, beside the volumes of the run."""
     settings = plan_settings(run_config, 1.0 / run_config.settings.fusion.rate_hz, RECORDED)
-    return RecordedMotion(model, joints, settings)
+    return RecordedMotion(model, joints, settings, static)
 
 
 def followers(run_config: RunConfig, given: RunProgramme, start_ns: int) -> dict[str, Planner | RecordedMotion]:
     """Makes all motions of a run: the chosen method, its baselines and, with joints in the log, the recorded robot."""
-    found: dict[str, Planner | RecordedMotion] = {**planners(run_config, given, start_ns)}
+    planned = planners(run_config, given, start_ns)
+    found: dict[str, Planner | RecordedMotion] = {**planned}
     if given.recorded is not None:
-        found[RECORDED] = recorded_motion(run_config, given.path.model, given.recorded)
+        static = next(iter(planned.values())).static
+        found[RECORDED] = recorded_motion(run_config, given.path.model, given.recorded, static)
     return found
+
+
+def scene_notes(moved: Mapping[str, Planner | RecordedMotion]) -> tuple[str, ...]:
+    """Returns notes on what the robots of a run keep clear of beside people."""
+    static = next(iter(moved.values())).static
+    return () if static is None else static.notes
 
 
 def robot_base(run_config: RunConfig, log: LogLike) -> Floats:
@@ -491,7 +541,14 @@ def plan_settings(run_config: RunConfig, dt_s: float, method: str) -> PlanSettin
     )
 
 
-def make_controller(method: str, model: RobotModel, path: Reference, settings: PlanSettings, s_s: float) -> Controller:
+def make_controller(
+    method: str,
+    model: RobotModel,
+    path: Reference,
+    settings: PlanSettings,
+    s_s: float,
+    static: StaticObstacles | None,
+) -> Controller:
     """Makes a controller that follows a path by a method, from ``s_s`` seconds of programmed time on.
 
     Args:
@@ -500,5 +557,6 @@ def make_controller(method: str, model: RobotModel, path: Reference, settings: P
         path: Programmed path.
         settings: Section 5 for the length of a tick.
         s_s: Programmed time at the start [s].
+        static: What the robot keeps clear of beside people; None: nothing.
     """
-    return CONTROLLERS[method](model, path, settings, s_s)
+    return CONTROLLERS[method](model, path, settings, s_s, static)

@@ -22,7 +22,7 @@ from hrcreplay.store.run_folder import RunWriter
 #: Parts that the fused person and the volumes depend on; each stage also depends on the stages before it.
 _PERSON = ("versions", "log", "ticks", "cameras", "watched", "settings logs", "settings fusion", "limits.tracking")
 _VOLUMES = (*_PERSON, "settings prediction", "limits.prediction")
-_PROGRAMME = ("base", "programme", "settings robot", "settings plan")
+_PROGRAMME = ("base", "objects", "programme", "settings robot", "settings plan")
 _JOINT_SETTINGS = tuple(key for key in Logs.model_fields if key.startswith("joint"))
 #: Stage -> the parts that its tables, counts and notes depend on. The plan uses the volumes of every tick, so the
 #: storage rate is not one of its parts.
@@ -79,6 +79,7 @@ def dependencies(run_config: RunConfig, log: LogLike, ticks_ns: Ints) -> dict[st
         base = assembly.known_robot_base(run_config, log)
         found |= {
             "base": None if base is None else base.tolist(),
+            "objects": [] if run_config.cell is None else [one.to_dict() for one in run_config.cell.objects],
             "programme": _programme(run_config, log, {key: settings["logs"][key] for key in _JOINT_SETTINGS}),
             "settings robot": [_without(settings["robot"], "urdf", "packages"), urdf_digest(run_config.settings)],
             "settings plan": _without(settings["plan"], "task"),

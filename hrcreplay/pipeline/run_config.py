@@ -23,7 +23,7 @@ from hrcreplay.limits import load_limits
 from hrcreplay.logs.unpack import ZSTD_MAGIC
 from hrcreplay.robot import irb140
 from hrcreplay.robot.model import Segment, from_urdf
-from hrcreplay.robot.urdf import Description, describe
+from hrcreplay.robot.urdf import Description, describe, disabled_pairs
 from hrcreplay.settings.load import Settings, as_overrides, load_settings
 from hrcreplay.settings.sections import LinkSettings, Robot
 from hrcreplay.store import run_folder
@@ -90,6 +90,24 @@ def read_urdf(robot: Robot) -> UrdfFiles | None:
         _check_size(mesh, _MESH_BYTES)
         _check_kind(mesh)
     return UrdfFiles(text, tuple(meshes.items()), tuple((str(file), run_folder.sha256(file)) for file in files))
+
+
+def read_srdf(robot: Robot) -> tuple[tuple[str, str], ...]:
+    """Returns the pairs of links that the SRDF in the settings disables; none without one.
+
+    Raises:
+        SettingsError: The file is missing or is not an SRDF.
+    """
+    path = robot.srdf
+    if path is None:
+        return ()
+    if not path.is_file():
+        raise SettingsError(f"robot.srdf: {path} is not a file; name an SRDF, or leave it out")
+    _check_size(path, _URDF_BYTES)
+    try:
+        return disabled_pairs(path.read_text())
+    except UnicodeDecodeError as error:
+        raise SettingsError(f"robot.srdf: {path} is not text ({error.reason}); name an SRDF") from error
 
 
 #: Maximum size of a URDF, and of a mesh: 400,000 triangles of a binary STL [bytes].
@@ -189,6 +207,7 @@ class RunConfig:
     prediction_limits: LimitSet
     earlier: Path | None  #: run folder given instead of a log
     recorded_urdf: UrdfFiles | None = None  #: file of an earlier run; None: as in the settings
+    recorded_srdf: tuple[tuple[str, str], ...] | None = None  #: pairs of an earlier run; None: as in the settings
 
     @property
     def urdf(self) -> UrdfFiles | None:
@@ -198,6 +217,15 @@ class RunConfig:
             SettingsError: As for ``read_urdf``.
         """
         return self.recorded_urdf or read_urdf(self.settings.robot)
+
+    @property
+    def disabled_pairs(self) -> tuple[tuple[str, str], ...]:
+        """Pairs of links that an SRDF does not keep apart.
+
+        Raises:
+            SettingsError: As for ``read_srdf``.
+        """
+        return read_srdf(self.settings.robot) if self.recorded_srdf is None else self.recorded_srdf
 
     @property
     def stages(self) -> tuple[str, ...]:
@@ -226,6 +254,7 @@ class RunConfig:
             "machine": describe_machine(),
             "inputs": [{"path": str(self.log), "sha256": self.log_sha256}, *_urdf_inputs(self.settings)],
             "urdf": _urdf_record(self) if "plan" in self.stages else None,
+            **({} if self.settings.robot.srdf is None else {"srdf": self.disabled_pairs}),
             "settings": self.settings.model_dump(mode="json"),
             "cell": None if self.cell is None else self.cell.to_dict(),
             "task": self.task,
@@ -331,6 +360,7 @@ def read_run_config(folder: Path) -> RunConfig:
         prediction_limits=recorded_limits(meta["limits"]["prediction"], folder),
         earlier=folder,
         recorded_urdf=_recorded_urdf(meta),
+        recorded_srdf=tuple((one, two) for one, two in meta["srdf"]) if "srdf" in meta else None,
     )
 
 

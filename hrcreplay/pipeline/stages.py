@@ -34,11 +34,13 @@ from hrcreplay.records import (
     Floats,
     HumanStates,
     Ints,
+    Motion,
     SkeletonTrack,
     SweptVolumes,
 )
 from hrcreplay.robot.control.controllers import Planner
 from hrcreplay.robot.control.recorded import RecordedMotion
+from hrcreplay.robot.control.static_obstacles import nearest
 from hrcreplay.settings.sections import Fusion
 from hrcreplay.store.columns import (
     measurement_columns,
@@ -46,6 +48,7 @@ from hrcreplay.store.columns import (
     occupancy_columns,
     record_columns,
     state_columns,
+    static_columns,
     truth_columns,
 )
 from hrcreplay.store.run_folder import Stopwatch
@@ -443,7 +446,8 @@ def plan_batches(
         for name, planner in planners.items():
             with sink.watch.stage(f"plan {name}", len(batch)):
                 motion = planner.follow(batch.t_ns, around, surroundings.names)
-            sink.tables.table("motion" if planner.chosen else f"motion_{name}", motion_columns(motion))
+            columns = motion_columns(motion) | nearest_columns(planner, motion)
+            sink.tables.table("motion" if planner.chosen else f"motion_{name}", columns)
             if planner.chosen:
                 stored = select_stored_ticks(done, len(batch), store_every)
                 with sink.watch.stage("hulls", len(stored)):
@@ -454,6 +458,21 @@ def plan_batches(
         done += len(batch)
         sink.progress("plan", len(batch))
         yield
+
+
+def nearest_columns(planner: Planner | RecordedMotion, motion: Motion) -> dict[str, Any]:
+    """Returns the columns of the nearest objects and links; none if the cell has no objects."""
+    static = planner.static
+    if static is None:
+        return {}
+    found = nearest(planner.robot, static, motion.q)
+    return static_columns(
+        object_m=found.object_m,
+        nearest_object=(found.object, static.names),
+        object_link=(found.object_link, motion.links),
+        self_m=found.links_m,
+        self_links=(found.links[:, 0], found.links[:, 1], motion.links),
+    )
 
 
 def print_note(text: str) -> None:

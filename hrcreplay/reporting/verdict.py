@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from hrcreplay.records import LIMBS, RECORDED
 from hrcreplay.reporting.metrics.contact import PERSONS, SHOWN_PARTS, method_prefixes
 from hrcreplay.reporting.metrics.fusion import add_limbs
@@ -53,7 +55,7 @@ def verdict(run: Run, metrics: Metrics) -> ContactSummary | None:
     return ContactSummary(
         (*_as_it_ran(run, metrics), _contact(metrics), _cost_in_short(run, metrics)),
         _speeds(run, metrics),
-        scope(metrics),
+        scope(run, metrics),
         _held(metrics),
         (_contact(metrics, detailed=True), _cost(run, metrics)),
         _table(run, metrics),
@@ -138,16 +140,17 @@ def _speeds(run: Run, metrics: Metrics) -> str:
     return f"{words}."
 
 
+#: Not considered in a run whose cell names no objects, and in one whose cell does.
+NO_OBJECTS = ("objects, table and fixtures", "the robot's own links")
+OTHER_OBJECTS = ("objects that the cell file does not name", "what the robot holds")
 #: Not considered in any run.
 NOT_CONSIDERED = (
-    "objects, table and fixtures",
-    "the robot's own links",
     "people whom no camera tracked",
     "different reactions of people to another motion",
 )
 
 
-def scope(metrics: Metrics) -> tuple[str, ...]:
+def scope(run: Run, metrics: Metrics) -> tuple[str, ...]:
     """Describes the scope of the verdict: considered and ignored parts."""
     others = metrics["others_frames"]["value"]
     people = "One person is planned for"
@@ -162,8 +165,22 @@ def scope(metrics: Metrics) -> tuple[str, ...]:
             f"The programme is the recorded robot's motion; {gaps_s:.2f} s of it were not recorded and are "
             "replaced by a straight line."
         )
-    nothing = f"Not considered: {', '.join((*NOT_CONSIDERED, *unseen_limbs(metrics)))}."
-    return (f"{people}.", *_watched(metrics), *programme, nothing)
+    beside = _beside(run)
+    ignored = (*(OTHER_OBJECTS if beside else NO_OBJECTS), *NOT_CONSIDERED, *unseen_limbs(metrics))
+    return (f"{people}.", *_watched(metrics), *programme, *beside, f"Not considered: {', '.join(ignored)}.")
+
+
+def _beside(run: Run) -> list[str]:
+    """Describes the distances from the objects of the cell and between the robot's own links."""
+    if run.motion is None or "object_distance_m" not in run.motion:
+        return []
+    parts = []
+    for name, column in (("an object of its cell", "object_distance_m"), ("each other", "self_distance_m")):
+        apart = run.motion[column].to_numpy(dtype=float)
+        if np.isfinite(apart).any():
+            parts.append(f"{1e3 * np.nanmin(apart):.0f} mm of {name}")
+    words = f"Its links came within {' and within '.join(parts)}" if parts else "No link is kept off an object"
+    return [f"{words}; notes say which links are not kept apart, or may approach an object."]
 
 
 def _watched(metrics: Metrics) -> list[str]:
@@ -425,7 +442,7 @@ def line(run: Run, metrics: Metrics) -> str:
             parts.append(f"{method} did not move beside a known person")
     known = f"{text_of(metrics['plan_body_known_ticks'])} of {text_of(metrics['plan_ticks'])} ticks"
     judged = f"moving robot against everybody recorded ({metrics['contact_person']['value']}, person known at {known})"
-    return f"{judged}: {'; '.join(parts)}. {' '.join(scope(metrics))}"
+    return f"{judged}: {'; '.join(parts)}. {' '.join(scope(run, metrics))}"
 
 
 #: Share of the time without measurement above which a limb gets a remark.

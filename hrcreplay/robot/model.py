@@ -83,6 +83,7 @@ class RobotModel:
     locked: tuple[str, ...]  #: joints off the chain, locked at zero or at the nearest end of their range
     tcp_in_frame_m: Floats  #: (3,) TCP in the frame of that link [m]
     tcp_outside_m: float  #: distance from the TCP to the capsules of the last link; 0 inside one, NaN without one [m]
+    moves: Bools  #: (s, nv) axes that move each segment
     axis_reach_m: Floats  #: (nv, s) upper bound of the distance from an axis of rotation to a segment's axis [m]
     _kinematics: _Kinematics = field(repr=False, compare=False)
 
@@ -293,6 +294,7 @@ def from_urdf(
         locked=robot.locked,
         tcp_in_frame_m=np.array(offset.translation),
         tcp_outside_m=_outside(model, segments, points, tcp),
+        moves=np.array([_support(model, point) for point in points[::2]]).reshape(-1, model.nv),
         axis_reach_m=_axis_reach_m(model, points),
         _kinematics=_Kinematics(model, points, tcp),
     )

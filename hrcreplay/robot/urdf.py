@@ -120,6 +120,30 @@ def with_shapes(robot: Description, paths: Mapping[str, str]) -> tuple[str, dict
     return ET.tostring(root, encoding="unicode"), names
 
 
+def disabled_pairs(xml: str) -> tuple[tuple[str, str], ...]:
+    """Pairs of links whose collisions an SRDF disables, in order.
+
+    Args:
+        xml: SRDF text.
+
+    Raises:
+        SettingsError: The text is no SRDF, or a pair lacks a link.
+    """
+    try:
+        robot = ET.fromstring(xml)  # noqa: S314  the user's own file; expat bounds entity expansion
+    except ET.ParseError as error:
+        raise SettingsError(f"robot.srdf: not an SRDF ({error})") from error
+    if robot.tag != "robot":
+        raise SettingsError(f"robot.srdf: found <{robot.tag}>; an SRDF is a <robot> with disable_collisions")
+    found = []
+    for pair in robot.iter("disable_collisions"):
+        one, two = pair.get("link1"), pair.get("link2")
+        if one is None or two is None:
+            raise SettingsError(f"robot.srdf: disable_collisions between {one} and {two}; name two links")
+        found.append((one, two))
+    return tuple(sorted(set(found)))
+
+
 def own_extent(shape: Shape, geometry: Any) -> Extent:
     """Extent of a shape in its own frame.
 

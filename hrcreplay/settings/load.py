@@ -31,6 +31,7 @@ _WORDS = frozenset({"true", "false", "inf", "nan"})
 #: Settings that name files; a relative path in a settings file is searched beside that file first.
 _PATHS = (
     ("robot", "urdf"),
+    ("robot", "srdf"),
     ("robot", "packages"),
     ("plan", "task"),
     ("limits", "tracking"),

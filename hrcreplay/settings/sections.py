@@ -293,6 +293,9 @@ class Robot(Section):
     urdf: Path | None = None
     """URDF of another robot; none: the IRB 140. Joints that do not lie between base and tool are locked at zero. A
     relative path in a settings file is searched beside that file first, like packages, plan.task and limit files."""
+    srdf: Path | None = None
+    """SRDF of the robot: the pairs of links in its disable_collisions are not kept apart; with it the robot's own links
+    are kept apart also in a cell without objects."""
     packages: tuple[Path, ...] = ()
     """Directories of the packages of the meshes in that URDF (package://); searched before the directories at and above
     the URDF and those of ROS_PACKAGE_PATH."""

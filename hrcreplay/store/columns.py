@@ -175,6 +175,34 @@ def motion_columns(motion: Motion) -> Columns:
     return columns
 
 
+def static_columns(
+    *,
+    object_m: Floats,
+    nearest_object: tuple[Ints, tuple[str, ...]],
+    object_link: tuple[Ints, tuple[str, ...]],
+    self_m: Floats,
+    self_links: tuple[Ints, Ints, tuple[str, ...]],
+) -> Columns:
+    """Returns further columns of motion for a cell with objects: the nearest object and the nearest pair of links.
+
+    Args:
+        object_m: (n,) surface to surface, of links that keep the full distance; negative in overlap, NaN without one
+            [m].
+        nearest_object: (n,) indices of that object, -1 without one, and the names of all hulls.
+        object_link: (n,) indices of its link, and the names of all links.
+        self_m: (n,) surface to surface of two links that are kept apart; NaN without a pair [m].
+        self_links: (n,) indices of the two, -1 without a pair, and the names of all links.
+    """
+    return {
+        "object_distance_m": object_m,
+        "object": _names(*nearest_object),
+        "object_link": _names(*object_link),
+        "self_distance_m": self_m,
+        "self_link": _names(self_links[0], self_links[2]),
+        "self_other_link": _names(self_links[1], self_links[2]),
+    }
+
+
 def contact_columns(
     *,
     t_ns: Ints,

@@ -84,6 +84,7 @@ STALE = {
     "prediction.residual": "predict plan",
     "prediction.residual_unknown_m": "predict plan",
     "robot.urdf": "plan",
+    "robot.srdf": "plan",
     "robot.packages": "",  # what they hold counts, by the digests of its files
     "robot.base_frame": "plan",
     "robot.tcp_frame": "plan",
@@ -160,6 +161,7 @@ OTHER: dict[str, Any] = {
     "prediction.method": "paper",
     "prediction.store_hz": "all",
     "robot.urdf": "robot.urdf",
+    "robot.srdf": "robot.srdf",
     "robot.base_frame": "base",
     "robot.packages": ("meshes",),
     "robot.tcp_offset": {"position_m": (0.1, 0.0, 0.0)},
@@ -254,6 +256,7 @@ def test_a_setting_makes_the_stages_stale_that_depend_on_it(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("robot.urdf").write_text(ONE_AXIS)
+    Path("robot.srdf").write_text("<robot name='a'><disable_collisions link1='a' link2='b'/></robot>")
     source: Any = log
     if name.startswith("logs.joint"):  # nobody asks for joints where there is a task
         source = SimpleNamespace(header=replace(log.header, task=None))

@@ -214,6 +214,18 @@ def test_what_is_never_considered_is_always_said(run: Run) -> None:
         assert what in lines(run, metrics_of(run))[-1]
 
 
+def test_what_is_considered_beside_objects_is_said(run: Run) -> None:
+    assert run.motion is not None
+    near = run.motion.assign(object_distance_m=0.25, self_distance_m=np.nan)
+    near.loc[near.index[3], "object_distance_m"] = 0.0314
+    found = verdict.verdict(dataclasses.replace(run, motion=near), metrics_of(run))
+    assert found is not None
+    assert tells(found.scope, "31 mm", "object")
+    assert not tells(found.scope, "each other")
+    assert "table and fixtures" not in found.scope[-1]
+    assert tells(found.scope[-1], "cell file", "no camera tracked")
+
+
 def test_a_limb_that_nobody_measured_is_said_before_all_else(run: Run) -> None:
     assert run.contact is not None
     shown = dataclasses.replace(run, contact=run.contact.assign(person="camera points"))

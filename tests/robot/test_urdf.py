@@ -10,7 +10,7 @@ from hrcreplay.errors import SettingsError
 from hrcreplay.pipeline.assembly import _robot as build_robot
 from hrcreplay.pipeline.run_config import UrdfFiles
 from hrcreplay.robot.model import from_urdf
-from hrcreplay.robot.urdf import describe
+from hrcreplay.robot.urdf import describe, disabled_pairs
 from hrcreplay.settings.load import load_settings
 from tests.facts import facts
 from tests.robot.test_model import AT_ORIGIN, joint, link, pedestal, robot_xml
@@ -148,3 +148,11 @@ def test_macros_are_no_urdf() -> None:
         describe(xml)
     expanded = arm().replace("<robot ", "<robot xmlns:xacro='http://www.ros.org/wiki/xacro' ")
     assert describe(expanded).joints == ("one", "two")
+
+
+def test_an_srdf_names_the_pairs_that_are_not_kept_apart() -> None:
+    pairs = "<disable_collisions link1='b' link2='a' reason='Adjacent'/><disable_collisions link1='a' link2='c'/>"
+    assert disabled_pairs(f"<robot name='r'><group name='arm'/>{pairs}</robot>") == (("a", "c"), ("b", "a"))
+    for text in ("<robot", "<semantic/>", "<robot><disable_collisions link1='a'/></robot>"):
+        with pytest.raises(SettingsError, match=r"robot\.srdf"):
+            disabled_pairs(text)

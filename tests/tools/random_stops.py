@@ -4,6 +4,9 @@ The check shares nothing with the certificate: kinematics of its own from the ax
 a tick as the parabola it is, 50 instants, 20 points a link, and the distance from a point to a box in closed form.
 
     python -m tests.tools.random_stops --count 1000000 --seed 1
+
+With ``--objects`` about half of the boxes stand in the cell instead of being limbs, and the links of the robot keep off
+each other.
 """
 
 from __future__ import annotations
@@ -18,6 +21,7 @@ from hrcreplay.records import LIMBS, Floats, SweptVolumes
 from hrcreplay.robot.control.certificate import NO_PLANES, clear
 from hrcreplay.robot.control.control_step import Stop, at_rest, stop_axis_by_axis, stop_straight
 from hrcreplay.robot.control.separation import Obstacles, obstacles
+from hrcreplay.robot.control.static_obstacles import StaticHull, StaticObstacles, static_obstacles
 from hrcreplay.robot.model import RobotModel, irb140
 
 DT_S, TOOL_M = 0.004, 0.10
@@ -30,6 +34,8 @@ _ABOUT = np.array([2, 1, 1, 0, 1, 0])
 _CARRIER = np.array([0, 1, 2, 4, 5])
 _ENDS = np.array([[0.07, 0, 0], [0, 0, 0.36], [0.38, 0, 0], [0.065, 0, 0], [TOOL_M, 0, 0]])
 RADII_M = np.array([0.219, 0.152, 0.118, 0.077, 0.045])
+#: Links that are kept apart: more than one axis turns between them, and they do not always overlap.
+PAIRS = np.array([(0, 2), (0, 3), (0, 4), (1, 3), (1, 4)])
 #: Of the corners of a box.
 _SIGNS = np.array(np.meshgrid((-1, 1), (-1, 1), (-1, 1))).reshape(3, -1).T
 
@@ -105,6 +111,26 @@ def deepest_m(going: Stop, stop: Stop, boxes: list[Box]) -> float:
     return max(_deepest(points, box.centre_m, box.turn, box.half_m, box.radius_m) for box in boxes)
 
 
+def deepest_pair_m(going: Stop, stop: Stop) -> float:
+    """How far two links enter each other at most during step and stop [m]."""
+    points = link_points(instants(going, stop))
+    return max(_deepest_pair(points, one, two) for one, two in PAIRS.tolist())
+
+
+@njit(cache=True)
+def _deepest_pair(points: Floats, one: int, two: int) -> float:
+    """The same for two links, point by point."""
+    least = np.inf
+    for n in range(points.shape[0]):
+        for i in range(points.shape[2]):
+            for k in range(points.shape[2]):
+                square = 0.0
+                for c in range(3):
+                    square += (points[n, one, i, c] - points[n, two, k, c]) ** 2
+                least = min(least, square)
+    return RADII_M[one] + RADII_M[two] - np.sqrt(least)
+
+
 @njit(cache=True)
 def _deepest(points: Floats, centre: Floats, turn: Floats, half: Floats, radius: float) -> float:
     """The same for one box, from its points' coordinates in the box."""
@@ -142,9 +168,18 @@ def random_boxes(rng: np.random.Generator, near_m: Floats) -> list[Box]:
     return found
 
 
+def as_static(robot: RobotModel, boxes: list[Box]) -> StaticObstacles:
+    """The boxes as objects of the cell, and the pairs of links whose capsules do not always overlap."""
+    hulls = [StaticHull(f"box {i}", box.corners(), box.radius_m) for i, box in enumerate(boxes)]
+    keep_m = RADII_M[:, None] + np.array([box.radius_m for box in boxes])
+    pair_keep_m = RADII_M[PAIRS].sum(axis=1)
+    return static_obstacles(robot, hulls, keep_m, np.ones(keep_m.shape, bool), PAIRS, pair_keep_m)
+
+
 def as_obstacles(boxes: list[Box]) -> Obstacles:
     """The boxes as limbs."""
-    corners, radius = np.concatenate([box.corners() for box in boxes]), np.array([[box.radius_m for box in boxes]])
+    corners = np.concatenate([np.empty((0, 3)), *(box.corners() for box in boxes)])
+    radius = np.array([[box.radius_m for box in boxes]], dtype=float)
     offsets, names = np.arange(len(boxes) + 1) * 8, LIMBS[: len(boxes)]
     return obstacles(SweptVolumes(np.array([0]), offsets, corners, radius, names, "sound"), 0)
 
@@ -171,8 +206,8 @@ class Outcome:
     deepest_m: float = -np.inf  #: of certified ones
 
 
-def run(count: int, seed: int) -> Outcome:
-    """Tries random stops until ``count`` have been certified."""
+def run(count: int, seed: int, *, objects: bool = False) -> Outcome:
+    """Tries random stops until ``count`` have been certified; with ``objects`` beside objects and other links."""
     rng, found = np.random.default_rng(seed), Outcome()
     robots = [irb140(np.eye(4), stop_s=stop_s, tool_m=TOOL_M) for stop_s in (0.1, 0.377, 0.8)]
     planes = NO_PLANES
@@ -181,8 +216,12 @@ def run(count: int, seed: int) -> Outcome:
         going, stop = random_step(rng, robot, together=rng.random() < 0.7)
         boxes = random_boxes(rng, link_points(stop.q[-1:]).reshape(-1, 3))
         planes = NO_PLANES if rng.random() < 0.5 else planes  # also those of another scene
-        ok, planes = clear(robot, going, stop, as_obstacles(boxes), 0.0, DT_S, planes)
+        limbs = int(rng.integers(len(boxes) + 1)) if objects else len(boxes)
+        static = as_static(robot, boxes[limbs:]) if objects else None
+        ok, planes = clear(robot, going, stop, as_obstacles(boxes[:limbs]), 0.0, DT_S, planes, static=static)
         depth = deepest_m(going, stop, boxes)
+        if objects:
+            depth = max(depth, deepest_pair_m(going, stop))
         if ok:
             found.certified += 1
             found.deepest_m = max(found.deepest_m, depth)
@@ -198,8 +237,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.tools.random_stops", description=__doc__)
     parser.add_argument("--count", type=int, default=20_000)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--objects", action="store_true")
     given = parser.parse_args()
-    print(run(given.count, given.seed))  # noqa: T201
+    print(run(given.count, given.seed, objects=given.objects))  # noqa: T201
 
 
 if __name__ == "__main__":

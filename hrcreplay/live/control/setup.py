@@ -235,9 +235,10 @@ def _setup(run_config: RunConfig, scene: HeaderOnlyLog, *, sending: bool) -> Con
     robot = assembly.robot(run_config, assembly.robot_base(run_config, scene))
     programme = assembly.programme(run_config, scene, robot).path
     settings = assembly.plan_settings(run_config, live.cycle_s, plan.method)
+    static = assembly.static_scene(run_config, robot, programme, 0.0)
 
     def follow(path: Reference, s_s: float) -> Controller:
-        return assembly.make_controller(plan.method, robot, path, settings, s_s)
+        return assembly.make_controller(plan.method, robot, path, settings, s_s, static)
 
     return ControlSetup(
         robot=robot,

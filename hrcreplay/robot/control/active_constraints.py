@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import linprog, nnls
 
-from hrcreplay.geometry.distances import distances
-from hrcreplay.records import Floats
+from hrcreplay.geometry.distances import distances, segment_distance
+from hrcreplay.records import Floats, Ints
 from hrcreplay.robot.control import qp_controller
 from hrcreplay.robot.control.certificate import MARGIN_M
 from hrcreplay.robot.control.control_step import PlanSettings, Proposal, Proposals, Stop
@@ -27,6 +27,7 @@ from hrcreplay.robot.control.controllers import (
 )
 from hrcreplay.robot.control.minimiser import SLACK, Problem, Solution, minimise
 from hrcreplay.robot.control.separation import Approach, Obstacles, tick_rows
+from hrcreplay.robot.control.static_obstacles import StaticObstacles, plane_rows
 from hrcreplay.robot.model import RobotModel
 
 #: A row is active if its link could approach faster by no more than this [m/s].
@@ -96,8 +97,33 @@ def _by_program(controller: QpController, seen: Observation) -> tuple[Proposals,
             task = qp_controller.problem(qp, settings.without_jerk())
             solved = minimise(task)
     if isinstance(solved, Solution):
-        return proposals, find_holding_rows(task, solved)
-    return proposals, {"unsolved": solved.status, "conflict": conflict(all_rows(task))}
+        found = find_holding_rows(task, solved)
+    else:
+        found = {"unsolved": solved.status, "conflict": conflict(all_rows(task))}
+    if controller.static is None:
+        return proposals, found
+    which, _, _ = plane_rows(controller.static, seen.sight.pose, 1.0)
+    return proposals, _with_planes_named(found, which, controller.static)
+
+
+def _with_planes_named(found: dict[str, Any], which: Ints, static: StaticObstacles) -> dict[str, Any]:
+    """Says of each row of a plane which link it keeps off which object or link."""
+    named = dict(found)
+    for key in ("binding", "next", "conflict"):
+        rows: list[dict[str, Any]] = []
+        for row in found.get(key, ()):
+            if row["kind"] == "plane":
+                link, end, hull, other = which[row["plane"]].tolist()
+                more = {"kind": "object", "object": static.names[hull]}
+                if hull < 0:
+                    more = {"kind": "self", "other_link": other // 2}
+                row = (
+                    {name: value for name, value in row.items() if name != "plane"} | more | {"link": link, "end": end}
+                )
+            rows.append(row)
+        if key in found:
+            named[key] = rows
+    return named
 
 
 def _rows(controller: Controller, seen: Observation, give_way_m: float) -> Approach:
@@ -128,7 +154,7 @@ def find_holding_rows(task: Problem, solved: Solution) -> dict[str, Any]:
     """
     w, slack = solved.dq_next, solved.slack
     every, margins = all_rows(task), margins_of(task.rows, w, slack)
-    loose = np.array([name["kind"] == "approach" for name in every.names], dtype=float)
+    loose = np.array([name["kind"] in ("approach", "plane") for name in every.names], dtype=float)
     active = np.flatnonzero(every.b + slack * loose - every.A @ w <= ACTIVE)
     A, pull = every.A[active], task.H @ w + task.g
     if task.soft:
@@ -136,25 +162,30 @@ def find_holding_rows(task: Problem, solved: Solution) -> dict[str, Any]:
         if slack <= ACTIVE:  # the slack is at its bound 0
             A = np.vstack([A, -np.eye(len(pull))[-1]])
     weights = _least_weights(A, -pull)[: len(active)] if len(A) else np.zeros(0)
-    limits, weight_of, vertex_of = [], dict[tuple[int, int, int], float](), dict[tuple[int, int, int], Any]()
+    limits, weight_of, vertex_of = [], dict[tuple[int, ...], float](), dict[tuple[int, ...], Any]()
     for i, weight in zip(active.tolist(), weights.tolist(), strict=True):
         name = every.names[i]
-        if name["kind"] != "approach":
+        if name["kind"] not in ("approach", "plane"):
             limits += [name] if weight > ACTIVE * np.abs(pull).max() else []
         elif solved.held and weight > 0.0:
-            key = name["link"], name["limb"], name["end"]
+            key = _key(name)
             vertex_of[key] = max(vertex_of.get(key, (-1.0, name)), (weight, name), key=lambda found: found[0])
             weight_of[key] = weight_of.get(key, 0.0) + weight
     least = SHARE * max(weight_of.values(), default=0.0)
     binding, others = [], []
     for row in margins:
-        key = row["link"], row["limb"], row["end"]
+        key = _key(row)
         if weight_of.get(key, 0.0) > least:
             binding.append({**row, **vertex_of[key][1], "multiplier": weight_of[key]})
         else:
             others.append(row)
     binding.sort(key=lambda row: -row["multiplier"])
     return {"binding": binding, "limits": limits, "next": others[:NEXT], "slack_m_per_s": slack}
+
+
+def _key(row: dict[str, Any]) -> tuple[int, ...]:
+    """Link, limb and row of Eq. (12) of a row of people; the index of a row of a plane."""
+    return (row["plane"],) if row["kind"] == "plane" else (row["link"], row["limb"], row["end"])
 
 
 def _least_weights(A: Floats, pull: Floats) -> Floats:
@@ -188,7 +219,9 @@ def margins_of(rows: Approach, w: Floats, slack: float) -> list[dict[str, Any]]:
                     {"kind": "approach", "link": link, "limb": limb, "end": end, "vertex": vertex - int(first)}
                     | {"vertex_m": rows.vertices_m[vertex].tolist(), "margin_m_per_s": float(margin)}
                 )
-    return sorted(found, key=lambda row: (row["margin_m_per_s"], row["link"], row["limb"], row["end"]))
+    for i, margin in enumerate((rows.plane_high + slack - rows.planes @ w).tolist()):
+        found.append({"kind": "plane", "plane": i, "margin_m_per_s": margin})
+    return sorted(found, key=lambda row: (row["margin_m_per_s"], *_key(row)))
 
 
 def _limits(task: Problem) -> tuple[Floats, Floats, tuple[dict[str, Any], ...]]:
@@ -225,7 +258,8 @@ def all_rows(task: Problem) -> LinearRows:
                     {"kind": "approach", "link": link, "limb": limb, "end": end, "vertex": j, "vertex_m": r.tolist()}
                     for j, r in enumerate(vertices)
                 ]
-    return LinearRows(np.concatenate(rows), np.concatenate(bounds), tuple(named))
+    named += [{"kind": "plane", "plane": i} for i in range(len(of.plane_high))]
+    return LinearRows(np.concatenate([*rows, of.planes]), np.concatenate([*bounds, of.plane_high]), tuple(named))
 
 
 def conflict(rows: LinearRows) -> list[dict[str, Any]]:
@@ -279,8 +313,9 @@ def explain_refusal(
     obstacles: Obstacles,
     horizon_s: float,
     settings: PlanSettings,
+    static: StaticObstacles | None = None,
 ) -> dict[str, Any]:
-    """First instant at which the step and the stop after it are not clear, with link and limb.
+    """First instant at which the step and the stop after it are not clear, with link and limb, object or other link.
 
     Args:
         robot: The manipulator.
@@ -289,6 +324,7 @@ def explain_refusal(
         obstacles: The swept volumes of the tick.
         horizon_s: Time from the tick on for which the volumes are valid [s].
         settings: Settings of the method.
+        static: Objects of the cell and pairs of links; None: there are none.
     """
     stop, last = proposal.stop, proposal.stop.q[-1]
     ends_s = (stop.ticks + 1) * settings.dt_s
@@ -314,7 +350,49 @@ def explain_refusal(
         if worst[0] <= 0.0:
             break
     left_m, i, link, limb, vertex, gap_m = worst
-    why = "not clear" if gap_m <= 0.0 else "not proven until the next tick" if left_m <= 0.0 else "hardly clear"
+    beside = None if static is None else _static_refusal(robot, static, q, dq, settings.dt_s)
+    if beside is not None and beside["left_m"] < left_m:
+        left = beside.pop("left_m")
+        return found | beside | {"why": "not clear" if beside["gap_m"] <= 0.0 else _unproven(left)}
+    why = "not clear" if gap_m <= 0.0 else _unproven(left_m)
     found |= {"why": why, "failed_s": i * settings.dt_s, "link": link, "limb": limb, "gap_m": gap_m}
     found["travel_m"] = float(travel_m[i, link])
     return found | {"vertex_m": obstacles.vertices_m[vertex].tolist()}
+
+
+def _unproven(left_m: float) -> str:
+    """Why a stop with a gap was refused."""
+    return "not proven until the next tick" if left_m <= 0.0 else "hardly clear"
+
+
+def _static_refusal(robot: RobotModel, static: StaticObstacles, q: Floats, dq: Floats, dt_s: float) -> dict[str, Any]:
+    """The row of a motion at which a link is least clear of objects and links, up to the first one that is not clear.
+
+    Args:
+        robot: The manipulator.
+        static: Objects of the cell and pairs of links.
+        q: (n, nv) rows of the motion [rad].
+        dq: (n, nv) speeds of the axes [rad/s].
+        dt_s: Length of a tick [s].
+    """
+    turned = np.maximum(np.abs(np.diff(q, axis=0)), dt_s * np.maximum(dq[:-1], dq[1:]))
+    none = np.zeros((1, len(q[0])))
+    travel, between = np.vstack((turned, none)) @ robot.axis_reach_m, np.vstack((turned, none)) @ static.pair_reach_m
+    worst: dict[str, Any] = {"left_m": np.inf, "gap_m": np.inf}
+    for i in range(len(q)):
+        ends = robot.ends_m(q[i])
+        gaps = [
+            (float(low), float(travel[i, s]), {"link": s, "object": static.names[k]})
+            for s, row in enumerate(distances(ends, static.vertices_m, static.offsets)[0] - static.keep_m)
+            for k, low in enumerate(row)
+        ]
+        for p, (one, two) in enumerate(static.pairs.tolist()):
+            apart = segment_distance(ends[one], ends[two])[0] - static.pair_keep_m[p]
+            gaps.append((float(apart), float(between[i, p]), {"link": one, "other_link": two}))
+        for gap, travelled, of in gaps:
+            if gap - MARGIN_M - travelled < worst["left_m"]:
+                worst = {"left_m": gap - MARGIN_M - travelled, "gap_m": gap - MARGIN_M, "travel_m": travelled}
+                worst |= of | {"failed_s": i * dt_s}
+        if worst["left_m"] <= 0.0:
+            break
+    return worst

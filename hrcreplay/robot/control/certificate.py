@@ -12,6 +12,9 @@ not retreat, and the person stays inside the volumes of each tick until their ho
 A robot inside a volume may retreat. The link may already touch the person when a retreating step begins, so the step is
 not clear of the person. Instead the certificate proves that no point of the link comes nearer to any point of the
 volume and that the link moves slowly. A link at rest that touches a person therefore only moves away.
+
+The objects of the cell and the robot's own links are checked in the same way: an object is a hull that stands, and of
+two links one is the hull. No link enters an object or another link, from standstill clear of them, by induction.
 """
 
 from __future__ import annotations
@@ -40,6 +43,7 @@ from hrcreplay.robot.control.control_step import (
     Taken,
 )
 from hrcreplay.robot.control.separation import Obstacles
+from hrcreplay.robot.control.static_obstacles import StaticObstacles
 from hrcreplay.robot.model import RobotModel
 
 #: Rounding tolerance of the check that a link moves away [m^2/s].
@@ -79,6 +83,22 @@ REFUSED, CLEAR, OPENING = range(3)
 RETREAT_SPEED = 0.25
 
 
+class _Course:
+    """A step and the stop after it, row by row; the ends of the links are computed at their first use."""
+
+    def __init__(self, robot: RobotModel, q: Floats, dq: Floats, dt_s: float) -> None:
+        self.robot, self.q, self.dq, self.dt_s = robot, q, dq, dt_s
+        self.radius_m = np.array([segment.radius_m for segment in robot.segments])
+        self.travel = _travel(q, dq, robot.axis_reach_m, dt_s)  #: (n, s) upper bound of the travel until each row [m]
+        self._rows: dict[int, Floats] = {}
+
+    def ends(self, row: int) -> Floats:
+        """(s, 2, 3) ends of the links at a row [m]."""
+        if row not in self._rows:
+            self._rows[row] = self.robot.ends_m(self.q[row])
+        return self._rows[row]
+
+
 def clear(
     robot: RobotModel,
     current_stop: Stop,
@@ -88,11 +108,12 @@ def clear(
     dt_s: float,
     planes: Floats,
     retreat_m: float = 0.0,
+    static: StaticObstacles | None = None,
 ) -> tuple[int, Floats]:
     """Checks that a step and the stop after it keep every link clear of every volume at all times.
 
     A link that begins inside a volume may move if no point of the link comes nearer to any point of the volume. This
-    holds for every position of the person inside the volume.
+    holds for every position of the person inside the volume. Objects and other links are always kept off.
 
     Args:
         robot: The manipulator.
@@ -101,9 +122,10 @@ def clear(
         obstacles: The swept volumes, valid until the stop has ended.
         clearance_m: Clearance beyond limb radius + link radius [m].
         dt_s: Length of a tick [s].
-        planes: (s, l, 3) directions from link to limb of the previous tick, which are good initial values; or
-            NO_PLANES.
+        planes: (s, l + o, 3) directions from link to limb and to object of the previous tick, which are good initial
+            values; or NO_PLANES.
         retreat_m: Largest depth inside a volume from which a link may move out of it [m].
+        static: Objects of the cell and pairs of links that are kept apart; None: there are none.
 
     Returns:
         The verdict and the planes for the next tick. The verdict is also REFUSED if a number is not finite, the stop
@@ -114,30 +136,64 @@ def clear(
     within = np.all((robot.q_min <= last) & (last <= robot.q_max))
     if not (obstacles.known and within and _can_be_done(q, dq, robot.ddq_max * dt_s, dt_s)):
         return REFUSED, planes
-    radius = np.array([segment.radius_m for segment in robot.segments])
-    keep_m = radius[:, None] + obstacles.radius_m + (clearance_m + MARGIN_M)
+    course = _Course(robot, q, dq, dt_s)
+    if static is None:
+        return _clear_of_people(course, obstacles, clearance_m, planes, retreat_m)
+    limbs, objects = len(obstacles.radius_m), len(static.radius_m)
+    if planes.shape[:2] != (len(robot.segments), limbs + objects):
+        planes = np.zeros((len(robot.segments), limbs + objects, 3))
+    people, beside = (np.ascontiguousarray(part) for part in np.split(planes, [limbs], axis=1))
+    verdict, people = _clear_of_people(course, obstacles, clearance_m, people, retreat_m)
+    if verdict != REFUSED and not _clear_of_static(course, static, beside):
+        verdict = REFUSED
+    return verdict, np.concatenate((people, beside), axis=1)
+
+
+def _clear_of_people(
+    course: _Course, obstacles: Obstacles, clearance_m: float, planes: Floats, retreat_m: float
+) -> tuple[int, Floats]:
+    """The verdict of `clear` on the volumes of people, and the planes for the next tick."""
+    keep_m = course.radius_m[:, None] + obstacles.radius_m + (clearance_m + MARGIN_M)
     if planes.shape[:2] != keep_m.shape:
         planes = np.zeros((*keep_m.shape, 3))
-    travel = _travel(q, dq, robot.axis_reach_m, dt_s)
-    far, hulls = travel[-1][:, None] + keep_m, (obstacles.vertices_m, obstacles.offsets)
-    ends = _Ends(robot, q)
-    undecided = _undecided(ends.at(0), *hulls, obstacles.boxes_m, planes, far)
+    far, hulls = course.travel[-1][:, None] + keep_m, (obstacles.vertices_m, obstacles.offsets)
+    undecided = _undecided(course.ends(0), *hulls, obstacles.boxes_m, planes, far)
     if len(undecided):
         planes = planes.copy()
     verdict, motion = CLEAR, None
     for link, limb in undecided.tolist():
         vertices = obstacles.vertices_m[obstacles.offsets[limb] : obstacles.offsets[limb + 1]]
-        if _keeps_off(ends, link, travel[:, link], vertices, keep_m[link, limb], planes[link, limb]):
+        if _keeps_off(course, link, vertices, course.travel[:, link], keep_m[link, limb], planes[link, limb]):
             continue
-        a, b = ends.at(0)[link]
+        a, b = course.ends(0)[link]
         gap = _gap(a, b, planes[link, limb], vertices) - keep_m[link, limb]
         if not -retreat_m < gap <= 0.0:
             return REFUSED, planes
-        motion = robot.link_motion(q, dq) if motion is None else motion
+        motion = course.robot.link_motion(course.q, course.dq) if motion is None else motion
         if not _moves_away(motion.ends_m[:, link], motion.twist[:, link], vertices):
             return REFUSED, planes
         verdict = OPENING
     return verdict, planes
+
+
+def _clear_of_static(course: _Course, static: StaticObstacles, planes: Floats) -> bool:
+    """Checks objects and pairs of links; writes the planes of objects for the next tick to ``planes``.
+
+    A point of the outer link of a pair moves relative to the inner one only by the axes between them.
+    """
+    keep_m = static.keep_m + MARGIN_M
+    far, hulls = course.travel[-1][:, None] + keep_m, (static.vertices_m, static.offsets)
+    for link, hull in _undecided(course.ends(0), *hulls, static.boxes_m, planes, far).tolist():
+        vertices = static.vertices_m[static.offsets[hull] : static.offsets[hull + 1]]
+        if not _keeps_off(course, link, vertices, course.travel[:, link], keep_m[link, hull], planes[link, hull]):
+            return False
+    travel = _travel(course.q, course.dq, static.pair_reach_m, course.dt_s)
+    pair_keep_m = static.pair_keep_m + MARGIN_M
+    for pair in _pairs_undecided(course.ends(0), static.pairs, travel[-1] + pair_keep_m).tolist():
+        link, other = static.pairs[pair].tolist()
+        if not _keeps_off(course, link, other, travel[:, pair], pair_keep_m[pair], np.zeros(3)):
+            return False
+    return True
 
 
 @njit(cache=True)
@@ -172,20 +228,22 @@ def _moves_away(ends: Floats, twist: Floats, vertices: Floats) -> bool:
     return True
 
 
-def _keeps_off(ends: _Ends, link: int, travel: Floats, vertices: Floats, keep_m: float, plane: Floats) -> bool:
-    """Checks one link against one limb by conservative advancement; writes the last plane to ``plane``.
+def _keeps_off(course: _Course, link: int, other: Floats | int, travel: Floats, keep_m: float, plane: Floats) -> bool:
+    """Checks one link against a limb, an object or another link by conservative advancement.
 
     Args:
-        ends: Ends of the links at each row of the motion.
+        course: The motion.
         link: Index of the link.
-        travel: (n,) result of `_travel` for the link [m].
-        vertices: (m, 3) vertices of the limb [m].
+        other: (m, 3) vertices of the limb or object [m], or the index of the other link.
+        travel: (n,) result of `_travel` for the link, relative to the other [m].
         keep_m: Distance to keep [m].
-        plane: (3,) initial direction from link to limb.
+        plane: (3,) initial direction from the link to the other; the last one is written to it.
     """
     row, last = 0, len(travel) - 1
     while True:
-        a, b = ends.at(row)[link]
+        ends = course.ends(row)
+        a, b = ends[link]
+        vertices = ends[other] if isinstance(other, int) else other
         there = _proven(travel, row, _gap(a, b, plane, vertices) - keep_m)
         if there < min(row + FEW, last):  # the previous plane proves too few rows
             normal = separating_normal(a, b, vertices)
@@ -198,20 +256,6 @@ def _keeps_off(ends: _Ends, link: int, travel: Floats, vertices: Floats, keep_m:
         if there <= row:
             return False
         row = there
-
-
-class _Ends:
-    """Ends of the links along a motion; each row is computed at its first use."""
-
-    def __init__(self, robot: RobotModel, q: Floats) -> None:
-        self._robot, self._q = robot, q
-        self._rows: dict[int, Floats] = {}
-
-    def at(self, row: int) -> Floats:
-        """(s, 2, 3) ends of the links at a row of the motion [m]."""
-        if row not in self._rows:
-            self._rows[row] = self._robot.ends_m(self._q[row])
-        return self._rows[row]
 
 
 @njit(cache=True)
@@ -284,6 +328,23 @@ def _undecided(ends: Floats, vertices: Floats, offsets: Ints, boxes: Floats, nor
             pairs[n, 0], pairs[n, 1] = s, k
             n += 1
     return pairs[:n]
+
+
+@njit(cache=True)
+def _pairs_undecided(ends: Floats, pairs: Ints, far: Floats) -> Ints:
+    """(n,) pairs of links whose balls around their middles do not prove a distance larger than ``far`` (p,) [m]."""
+    found = np.empty(len(pairs), np.int64)
+    n = 0
+    for p in range(len(pairs)):
+        apart, one, two = 0.0, 0.0, 0.0
+        for c in range(3):
+            a, b = ends[pairs[p, 0], :, c], ends[pairs[p, 1], :, c]
+            apart += (0.5 * (a[0] + a[1] - b[0] - b[1])) ** 2
+            one, two = one + (0.5 * (a[1] - a[0])) ** 2, two + (0.5 * (b[1] - b[0])) ** 2
+        if not math.sqrt(apart) - math.sqrt(one) - math.sqrt(two) > far[p]:
+            found[n] = p
+            n += 1
+    return found[:n]
 
 
 @njit(cache=True)
@@ -370,6 +431,7 @@ def decide(
     horizon_s: float,
     planes: Floats,
     settings: PlanSettings,
+    static: StaticObstacles | None = None,
 ) -> tuple[Taken, Floats]:
     """Takes the first certified proposal, or continues the current stop.
 
@@ -379,8 +441,9 @@ def decide(
         proposals: The proposals of the method, best first; or the reason why there is none.
         obstacles: The swept volumes of the tick.
         horizon_s: Time from the tick on for which the volumes are valid [s].
-        planes: (s, l, 3) planes between links and limbs of the previous tick.
+        planes: (s, l + o, 3) planes of the previous tick between links and limbs, then objects.
         settings: Settings of the method.
+        static: Objects of the cell and pairs of links; None: there are none.
 
     Returns:
         The executed motion, and the planes for the next tick.
@@ -391,8 +454,8 @@ def decide(
             return Taken(stop, status, 0, not stop.ticks and not current_stop.ticks), planes
         if (stop.ticks + 1) * settings.dt_s > horizon_s + 1e-9:
             continue
-        clearance_m, dt_s = settings.plan.clearance_m, settings.dt_s
-        verdict, planes = clear(robot, current_stop, stop, obstacles, clearance_m, dt_s, planes, settings.retreat_m)
+        plan, dt_s, retreat_m = settings.plan, settings.dt_s, settings.retreat_m
+        verdict, planes = clear(robot, current_stop, stop, obstacles, plan.clearance_m, dt_s, planes, retreat_m, static)
         if verdict == CLEAR:
             return Taken(stop, status, 0, certified=True), planes
         if verdict == OPENING and (stop.ticks or current_stop.ticks):

@@ -33,6 +33,7 @@ from hrcreplay.robot.control.control_step import (
 )
 from hrcreplay.robot.control.qp_controller import QpContext
 from hrcreplay.robot.control.separation import Obstacles
+from hrcreplay.robot.control.static_obstacles import StaticObstacles
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.task import Reference, ReferencePoint, advance, tcp_speed_cap
 
@@ -67,6 +68,7 @@ class Controller(ABC):
     reference: Reference
     settings: PlanSettings
     s_s: float = 0.0  #: programmed time of the reference [s]
+    static: StaticObstacles | None = None  #: objects of the cell and pairs of links; None: there are none
 
     def __post_init__(self) -> None:
         self.point = self.reference.sample(self.s_s)
@@ -90,8 +92,9 @@ class Controller(ABC):
         with np.errstate(all="ignore"):  # invalid numbers lead to braking, not to warnings
             seen = self.observe(predict)
             proposals = self.propose(seen)
+            seen_until = seen.obstacles, seen.horizon_s
             taken, self.planes = decide(
-                self.robot, current_stop, proposals, seen.obstacles, seen.horizon_s, self.planes, settings
+                self.robot, current_stop, proposals, *seen_until, self.planes, settings, self.static
             )
         step = make_step(seen.sight, current_stop, taken, seen.horizon_s, settings.dt_s)
         self.stop, self.u = step.stop, step.u
@@ -131,7 +134,8 @@ class QpController(Controller):
         self.point = self.reference.sample(self.s_s)
         cap = tcp_speed_cap(self.reference, self.s_s, self.settings.plan)
         target = qp_controller.Target(self.point.T_world_tcp, rate * self.point.twist, self.point.q, cap)
-        return QpContext(self.robot, self.state, self.u, target, seen.sight, seen.obstacles, seen.horizon_s)
+        seen_until = seen.sight, seen.obstacles, seen.horizon_s
+        return QpContext(self.robot, self.state, self.u, target, *seen_until, self.static)
 
     def _move_on(self) -> None:
         """Does nothing: ``qp_context`` has already advanced the reference."""
@@ -212,6 +216,16 @@ class Planner:
 
     controller: Controller
     chosen: bool  #: the run's method, not a baseline
+
+    @property
+    def robot(self) -> RobotModel:
+        """The robot."""
+        return self.controller.robot
+
+    @property
+    def static(self) -> StaticObstacles | None:
+        """Objects of the cell and pairs of links; None: there are none."""
+        return self.controller.static
 
     @property
     def dt_s(self) -> float:

@@ -27,6 +27,9 @@ EMPTY = 1e-9
 #: A combination of rows proves that there is no solution if its violation is everywhere larger than this.
 DENIED = 1e-9
 
+#: First index of a plane's row in the list of known rows, in place of a link.
+PLANE = -1
+
 #: Outcomes of `next_row`: no violated row; all violated rows are known; a new one; one that no velocity satisfies.
 CLEAR, KNOWN, NEW, HOPELESS = range(4)
 
@@ -73,7 +76,7 @@ def are_numbers_known(H: Floats, g: Floats, limits: Limits, rows: Approach) -> b
         rows: Approach rows of people.
     """
     total = H.sum() + g.sum() + limits.J.sum() + rows.ends_m.sum() + rows.J_ends.sum() + rows.vertices_m.sum()
-    total += rows.boxes_m.sum() + rows.per_speed.sum() + rows.stop_s
+    total += rows.boxes_m.sum() + rows.per_speed.sum() + rows.stop_s + rows.planes.sum() + rows.plane_high.sum()
     known = math.isfinite(total) and not np.isnan(rows.rhs_m2.sum())
     for bounds in (limits.low, limits.high, limits.J_low, limits.J_high):
         known = known and not np.isnan(bounds.sum())
@@ -217,9 +220,10 @@ def next_row(problem: Metric, y: Floats, limits: Limits, rows: Approach, known: 
     w = np.minimum(np.maximum(x[:nv], limits.low), limits.high)
     slack = max(0.0, x[nv]) if n > nv else 0.0
     loose = rows.rhs_m2 + rows.per_speed * slack
-    ends, J_ends, vertices, offsets, boxes, _, per_speed, stop_s = rows
-    which, A, values = worst_rows(Approach(ends, J_ends, vertices, offsets, boxes, loose, per_speed, stop_s), w, 0.0)
-    outcome, best, most = CLEAR, -1, HELD
+    ends, J_ends, vertices, offsets, boxes, _, per_speed, stop_s, planes, plane_high = rows
+    loosened = Approach(ends, J_ends, vertices, offsets, boxes, loose, per_speed, stop_s, planes, plane_high)
+    which, A, values = worst_rows(loosened, w, 0.0)
+    outcome, key, most = CLEAR, np.zeros(4, dtype=np.int64), HELD
     found, high, row = np.zeros(n), 0.0, np.zeros(n)
     for i in range(len(which)):
         pair = which[i, 0], which[i, 1]
@@ -239,8 +243,46 @@ def next_row(problem: Metric, y: Floats, limits: Limits, rows: Approach, known: 
             if _among(known, which[i]):
                 outcome = max(outcome, KNOWN)
             else:
-                outcome, best, most, found, high = NEW, i, broken, e / length, bound
-    return Found(outcome, w, slack, found, high, which[best].copy() if best >= 0 else np.zeros(4, dtype=np.int64))
+                outcome, key, most, found, high = NEW, which[i].copy(), broken, e / length, bound
+    found_row = Found(outcome, w, slack, found, high, key)
+    return found_row if outcome == HOPELESS else _with_planes(problem, y, rows, known, found_row, most)
+
+
+@njit(cache=True, error_model="numpy")
+def _with_planes(problem: Metric, y: Floats, rows: Approach, known: Ints, found: Found, most: float) -> Found:
+    """The new row of a plane that a candidate violates most, if it violates it more than ``found``; else ``found``.
+
+    Args:
+        problem: The problem in its metric.
+        y: (n,) the candidate.
+        rows: Approach rows.
+        known: (k, 4) indices of the known rows, as in `worst_rows`.
+        found: The row of people that it violates most.
+        most: Its violation, in the metric.
+    """
+    n, nv = len(y), len(found.w)
+    for i in range(len(rows.planes)):
+        if not dot_n(rows.planes[i], found.w) > rows.plane_high[i] + found.slack:
+            continue
+        row = np.zeros(n)
+        row[:nv] = rows.planes[i]
+        if n > nv:
+            row[nv] = -1.0
+        e = solve_lower(problem.L, row)
+        length = norm_n(e)
+        if not length > EMPTY:  # the bound is not negative, so the row holds
+            continue
+        bound = rows.plane_high[i] / length
+        broken = dot_n(e, y) / length - bound
+        if not broken > most:
+            continue
+        key = np.array([PLANE, i, 0, 0])
+        if not _among(known, key):
+            most = broken
+            found = Found(NEW, found.w, found.slack, e / length, bound, key)
+        elif found.outcome == CLEAR:
+            found = Found(KNOWN, found.w, found.slack, found.row, found.high, found.key)
+    return found
 
 
 @njit(cache=True, error_model="numpy")

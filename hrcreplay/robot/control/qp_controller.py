@@ -35,6 +35,7 @@ from hrcreplay.robot.control.control_step import (
 from hrcreplay.robot.control.metric_rows import Limits
 from hrcreplay.robot.control.minimiser import Problem, Solution, minimise
 from hrcreplay.robot.control.separation import Obstacles, tick_rows
+from hrcreplay.robot.control.static_obstacles import StaticObstacles
 from hrcreplay.robot.model import RobotModel
 
 #: Bound on the rotation of the TCP for each unit of the bound on its translation [rad/m].
@@ -147,6 +148,7 @@ class QpContext(NamedTuple):
     sight: Sight  #: the robot's pose, and its distances from people
     obstacles: Obstacles  #: the swept volumes of the tick
     horizon_s: float  #: time from the tick on for which the volumes are valid [s]
+    static: StaticObstacles | None = None  #: objects of the cell and pairs of links
 
 
 def pose_error(T_world_tcp: Floats, T_world_ref: Floats) -> Floats:
@@ -242,7 +244,7 @@ def problem(context: QpContext, settings: PlanSettings) -> Problem:
         context: Robot, reference and people of the tick.
         settings: Weights and limits.
     """
-    robot, state, u_before, target, sight, obstacles, horizon_s = context
+    robot, state, u_before, target, sight, obstacles, horizon_s, static = context
     plan, dt_s, pose = settings.plan, settings.dt_s, sight.pose
     J, dJdq = pose.J_tcp, pose.dJdq_tcp
     error = pose_error(pose.T_world_tcp, target.T_world_tcp)
@@ -271,8 +273,22 @@ def problem(context: QpContext, settings: PlanSettings) -> Problem:
         pairs.constraint_rhs_m2(plan.constraint_rhs, plan.give_way_m),
         pairs.distance_m,
         horizon_s + plan.lead_s,
+        None if static is None else static.rows(pose, static_ahead_s(horizon_s, settings)),
     )
     return Problem(H, g, limits, rows, plan.rows == "soft")
+
+
+def static_ahead_s(horizon_s: float, settings: PlanSettings) -> float:
+    """Time that the rows of objects and links look ahead [s].
+
+    A stop at constant deceleration covers the way of half its duration, and the robot follows its target velocity with
+    the time constant ``plan.smooth_s``. The horizon contains the stop and two ticks.
+
+    Args:
+        horizon_s: Time from the tick on until the end of the stop after the step [s].
+        settings: Settings of the method.
+    """
+    return 0.5 * horizon_s + settings.plan.smooth_s
 
 
 #: A TCP that is slower than this has no direction of motion [m/s].

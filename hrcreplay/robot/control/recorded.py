@@ -11,6 +11,7 @@ import numpy as np
 from hrcreplay.records import Floats, Ints, Motion, MotionRow
 from hrcreplay.robot.control.control_step import REASONS, PlanSettings, RobotState, observe, stop_straight
 from hrcreplay.robot.control.controllers import Predict
+from hrcreplay.robot.control.static_obstacles import StaticObstacles
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.recorded import UNKNOWN, RecordedJoints
 
@@ -22,6 +23,7 @@ class RecordedMotion:
     robot: RobotModel
     joints: RecordedJoints
     settings: PlanSettings
+    static: StaticObstacles | None = None  #: objects of the cell and pairs of links, for the record
     chosen: bool = False  #: it is never the run's method
 
     def follow(self, t_ns: Ints, around: Sequence[Predict], limbs: tuple[str, ...]) -> Motion:

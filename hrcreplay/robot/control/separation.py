@@ -118,13 +118,34 @@ class Approach(NamedTuple):
     rhs_m2: Floats  #: (s, l) right-hand side of Eq. (14) for every pair of link and limb [m^2]
     per_speed: Floats  #: (s, l) left-hand side of Eq. (14) for a link that approaches at 1 m/s [m s]
     stop_s: float  #: T_s of Eq. (70), or the time that the rows look ahead [s]
+    planes: Floats  #: (p, nv) rows of planes: speed of an end towards a plane for each joint's velocity [m/rad]
+    plane_high: Floats  #: (p,) bound on ``planes @ dq`` [m/s]
 
 
 #: Smallest distance between link and limb that is used to convert a row to a speed [m].
 _LEAST_M = 1e-3
 
 
-def tick_rows(pose: RobotPose, obstacles: Obstacles, rhs_m2: Floats, distance_m: Floats, stop_s: float) -> Approach:
+class PlaneRows(NamedTuple):
+    """Bounds on the speed of ends of links towards planes: Eq. (16) where a plane takes the place of the vertices."""
+
+    A: Floats  #: (p, nv) speed towards the plane for each joint's velocity [m/rad]
+    high: Floats  #: (p,) largest speed [m/s]
+
+
+def no_planes(nv: int) -> PlaneRows:
+    """No rows, for a robot of ``nv`` axes."""
+    return PlaneRows(np.empty((0, nv)), np.empty(0))
+
+
+def tick_rows(
+    pose: RobotPose,
+    obstacles: Obstacles,
+    rhs_m2: Floats,
+    distance_m: Floats,
+    stop_s: float,
+    planes: PlaneRows | None = None,
+) -> Approach:
     """The data of the approach rows of a tick; the rows themselves are not computed.
 
     Args:
@@ -133,10 +154,12 @@ def tick_rows(pose: RobotPose, obstacles: Obstacles, rhs_m2: Floats, distance_m:
         rhs_m2: (s, l) right-hand side of Eq. (14) for every pair of link and limb [m^2].
         distance_m: (s, l) between the link's axis and the limb's hull [m].
         stop_s: T_s of Eq. (70), or the time that the rows look ahead [s].
+        planes: Rows of what stands in the cell; None: there is nothing.
     """
     per_speed = stop_s * np.maximum(distance_m, _LEAST_M)
     around = obstacles.vertices_m, obstacles.offsets, obstacles.boxes_m
-    return Approach(pose.ends_m, pose.J_ends, *around, rhs_m2, per_speed, stop_s)
+    planes = no_planes(pose.J_tcp.shape[1]) if planes is None else planes
+    return Approach(pose.ends_m, pose.J_ends, *around, rhs_m2, per_speed, stop_s, *planes)
 
 
 @njit(cache=True)
@@ -154,9 +177,9 @@ def worst_rows(rows: Approach, dq_next: Floats, above_m2: float) -> tuple[Ints, 
 
     Returns:
         For the n violated rows: ``which`` (n, 4) link, limb, row of Eq. (12), row of ``vertices_m``; ``A`` (n, nv)
-        [m^2 s/rad]; ``A @ dq_next`` (n,) [m^2].
+        [m^2 s/rad]; ``A @ dq_next`` (n,) [m^2]. Rows of planes are not among them.
     """
-    ends, J_ends, vertices, offsets, boxes, rhs_m2, _, stop_s = rows
+    ends, J_ends, vertices, offsets, boxes, rhs_m2, _, stop_s, _, _ = rows
     links, limbs = rhs_m2.shape
     which = np.empty((2 * links * limbs, 4), dtype=np.int64)
     A, values = np.empty((len(which), len(dq_next))), np.empty(len(which))

@@ -15,7 +15,7 @@ from hrcreplay.records import Floats
 from hrcreplay.robot.control import minimiser
 from hrcreplay.robot.control.metric_rows import Limits, Metric
 from hrcreplay.robot.control.minimiser import SLACK, Problem, Solution, Unsolved, minimise
-from hrcreplay.robot.control.separation import Approach
+from hrcreplay.robot.control.separation import Approach, no_planes
 from hrcreplay.robot.model import RobotModel
 from tests.robot.swinging import STOP_S, dense, random_tick, robot
 
@@ -32,7 +32,7 @@ def people(A: Floats, high: Floats, per_speed: float = 1.0) -> Approach:
     J_ends[0, :] = np.eye(3)
     boxes = np.stack([A, A], axis=1)
     per = np.full((1, m), per_speed)
-    return Approach(np.zeros((1, 2, 3)), J_ends, A, np.arange(m + 1), boxes, high[None], per, 1.0)
+    return Approach(np.zeros((1, 2, 3)), J_ends, A, np.arange(m + 1), boxes, high[None], per, 1.0, *no_planes(3))
 
 
 def asked(
@@ -221,6 +221,7 @@ def test_no_number_makes_it_raise(robot: RobotModel, soft: bool, bad: float) -> 
     task = replace(random_tick(robot, np.random.default_rng(5)).task, soft=soft)
     limits = Limits(*(np.array(field) for field in task.limits))
     own: dict[str, Any] = {name: np.array(field) for name, field in task.rows._asdict().items() if name != "stop_s"}
+    own |= {"planes": np.eye(2, 6), "plane_high": np.full(2, 0.1)}
     rows = task.rows._replace(**own | {"vertices_m": own["vertices_m"].view()})
     rows.vertices_m.flags.writeable = False  # as vertices are: so the kernels are those that a run has
     task = replace(task, H=task.H.copy(), g=task.g.copy(), limits=limits, rows=rows)

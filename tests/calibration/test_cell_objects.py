@@ -1,0 +1,223 @@
+"""Objects of a cell file: what they are, how they come back, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import coal
+import numpy as np
+import pytest
+from scipy.spatial import ConvexHull, Delaunay
+
+from hrcreplay.calibration.cell import Cell, load_cell, write_cell
+from hrcreplay.calibration.cell_objects import MOST_VERTICES, CellObject
+from hrcreplay.calibration.meshes import read_parts
+from hrcreplay.errors import SettingsError
+from hrcreplay.records import Floats, Ints
+
+MOST = {"most_parts": 64, "most_vertices": MOST_VERTICES}
+CELL = """
+[[objects]]
+name = "table"
+shape = "box"
+size_m = [1.0, 0.6, 0.04]
+position_m = [0.7, 0.0, 0.8]
+rpy_deg = [0, 0, 30]
+frame = "base"
+may_approach = ["tool"]
+
+[[objects]]
+name = "floor"
+shape = "half_space"
+normal = [0, 0, 1]
+
+[[objects]]
+name = "post"
+shape = "cylinder"
+radius_m = 0.05
+length_m = 1.2
+programme_may_touch = true
+
+[[objects]]
+name = "pipe"
+shape = "capsule"
+radius_m = 0.03
+length_m = 0.5
+
+[[objects]]
+name = "ball"
+shape = "sphere"
+radius_m = 0.1
+
+[[objects]]
+name = "wedge"
+shape = "hulls"
+parts_m = [[[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]]
+"""
+
+
+def cell(tmp_path: Path, text: str) -> Cell:
+    (tmp_path / "cell.toml").write_text(text)
+    return load_cell(tmp_path / "cell.toml")
+
+
+def test_objects_come_back_through_a_file_and_through_json(tmp_path: Path) -> None:
+    read = cell(tmp_path, CELL)
+    assert [one.name for one in read.objects] == ["table", "floor", "post", "pipe", "ball", "wedge"]
+    write_cell(read, tmp_path / "again.toml")
+    assert load_cell(tmp_path / "again.toml") == read
+    assert Cell.from_dict(json.loads(json.dumps(read.to_dict()))) == read
+    assert read.objects[0].to_dict()["may_approach"] == ["tool"]
+    assert "frame" not in read.objects[1].to_dict(), "what is not said is not written"
+
+
+def test_a_cell_without_objects_is_written_as_before() -> None:
+    assert "objects" not in Cell().to_dict()
+
+
+def test_the_pose_is_that_of_the_angles(tmp_path: Path) -> None:
+    T = cell(tmp_path, CELL).objects[0].T_frame_object()
+    c, s = np.cos(np.pi / 6), np.sin(np.pi / 6)
+    np.testing.assert_allclose(T, [[c, -s, 0, 0.7], [s, c, 0, 0], [0, 0, 1, 0.8], [0, 0, 0, 1]], atol=1e-12)
+
+
+def test_parts_enclose_the_shape_as_coal_has_it_and_little_more(tmp_path: Path) -> None:
+    shapes = {
+        "table": coal.Box(1.0, 0.6, 0.04),
+        "post": coal.Cylinder(0.05, 1.2),
+        "pipe": coal.Capsule(0.03, 0.5),
+        "ball": coal.Sphere(0.1),
+    }
+    rng = np.random.default_rng(0)
+    probe = coal.Sphere(1e-6)
+    for one in cell(tmp_path, CELL).objects:
+        if one.name not in shapes:
+            continue
+        ((points, radius),) = one.parts()
+        for direction in rng.normal(size=(50, 3)):
+            u = direction / np.linalg.norm(direction)
+            far = coal.Transform3s(np.eye(3), 10.0 * u)
+            extent = float((points @ u).max()) + radius
+            result = coal.DistanceResult()
+            coal.distance(shapes[one.name], coal.Transform3s(), probe, far, coal.DistanceRequest(), result)
+            nearest = np.asarray(result.getNearestPoint1())
+            assert (nearest @ u) <= extent + 1e-6
+            assert extent <= (nearest @ u) + 0.0021 or one.shape in ("box", "cylinder")
+        if one.shape == "cylinder":
+            assert np.hypot(points[:, 0], points[:, 1]).max() == pytest.approx(0.05 / np.cos(np.pi / 16))
+            flat = points[np.isclose(points[:, 2], 0.6)][:, :2]
+            sides = zip(flat, np.roll(flat, -1, 0), strict=True)
+            assert min(abs(a[0] * b[1] - a[1] * b[0]) / np.linalg.norm(b - a) for a, b in sides) >= 0.05 - 1e-12
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("shape = 'box'", {"size_m", "box"}),
+        ("shape = 'box'\nsize_m = [1, 1]", {"size_m"}),
+        ("shape = 'box'\nsize_m = [1, 1, -1]", {"size_m", "0"}),
+        ("shape = 'ball'\nradius_m = 1", {"shape", "sphere", "half_space"}),
+        ("shape = 'sphere'\nradius_m = 1\nlength_m = 1", {"length_m", "sphere", "radius_m"}),
+        ("shape = 'half_space'\nnormal = [0, 0, 0]", {"normal"}),
+        ("shape = 'sphere'\nradius_m = 1\nradius = 1", {"radius", "radius_m", "may_approach"}),
+        ("shape = 'mesh'\nfile = 'nowhere.stl'", {"nowhere.stl", ".stl", "one"}),
+        ("shape = 'sphere'\nradius_m = 1\n[[objects]]\nname = 'one'\nshape = 'sphere'\nradius_m = 1", {"one", "twice"}),
+    ],
+)
+def test_a_wrong_object_is_told_in_a_line(tmp_path: Path, text: str, told: set[str]) -> None:
+    with pytest.raises(SettingsError) as refused:
+        cell(tmp_path, f"[[objects]]\nname = 'one'\n{text}")
+    assert "\n" not in str(refused.value)
+    assert all(word in str(refused.value) for word in told), str(refused.value)
+
+
+def stl(path: Path, vertices: Floats, triangles: Ints) -> Path:
+    body = b"".join(
+        struct.pack("<12fH", *np.zeros(3), *vertices[triangle].astype(np.float32).ravel(), 0) for triangle in triangles
+    )
+    path.write_bytes(b"\0" * 80 + struct.pack("<I", len(triangles)) + body)
+    return path
+
+
+def obj(path: Path, vertices: Floats, triangles: Ints) -> Path:
+    lines = [f"v {x} {y} {z}" for x, y, z in vertices.tolist()]
+    lines += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in triangles.tolist()]
+    path.write_text("\n".join(lines))
+    return path
+
+
+def turned_out(vertices: Floats, triangles: Ints) -> Ints:
+    """Triangles of a convex mesh, counterclockwise from outside."""
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    inward = (np.cross(b - a, c - a) * (a - vertices.mean(axis=0))).sum(axis=1) < 0.0
+    return np.where(inward[:, None], triangles[:, ::-1], triangles)
+
+
+def solid(points: Floats) -> tuple[Floats, Ints]:
+    hull = ConvexHull(points)
+    return points, turned_out(points, hull.simplices.astype(np.int64))
+
+
+def ell() -> tuple[Floats, Ints]:
+    """An L: a prism over six corners, whose volume is three quarters of a box and 6/7 of its hull."""
+    flat = np.array([[0, 0], [2, 0], [2, 1], [1, 1], [1, 2], [0, 2]], dtype=float)
+    vertices = np.vstack([np.column_stack([flat, np.full(6, z)]) for z in (0.0, 1.0)])
+    top = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]])
+    sides = [t for i in range(6) for t in ([i, (i + 1) % 6, 6 + (i + 1) % 6], [i, 6 + (i + 1) % 6, 6 + i])]
+    return vertices, np.vstack([top[:, ::-1], top + 6, sides])
+
+
+@pytest.mark.parametrize("write", [stl, obj])
+def test_a_convex_mesh_is_its_corners(tmp_path: Path, write: object) -> None:
+    corners = np.array([[x, y, z] for x in (0, 10) for y in (0, 20) for z in (0, 5)], dtype=float)
+    assert callable(write)
+    path = write(tmp_path / f"box.{getattr(write, '__name__', '')}", *solid(corners))
+    (part,) = read_parts(path, 0.001, "refuse", "cell", **MOST)
+    assert sorted(part.tolist()) == sorted((0.001 * corners).tolist())
+
+
+def test_a_mesh_of_many_corners_is_enclosed_by_few(tmp_path: Path) -> None:
+    points = np.random.default_rng(0).normal(size=(1500, 3))
+    points *= np.array([0.5, 0.3, 0.2]) / np.linalg.norm(points, axis=1, keepdims=True)
+    (part,) = read_parts(stl(tmp_path / "egg.stl", *solid(points)), 1.0, "refuse", "cell", **MOST)
+    assert len(part) <= MOST_VERTICES
+    assert (Delaunay(part).find_simplex(points.astype(np.float32), tol=1e-7) >= 0).all()
+    assert ConvexHull(part).volume < 1.35 * ConvexHull(points).volume
+
+
+def test_a_concave_mesh_is_refused_unless_its_hull_is_wanted(tmp_path: Path) -> None:
+    path = obj(tmp_path / "ell.obj", *ell())
+    with pytest.raises(SettingsError) as refused:
+        read_parts(path, 1.0, "refuse", "cell: object ell", **MOST)
+    assert all(word in str(refused.value) for word in ("ell.obj", "86%", "decompose")), str(refused.value)
+    (part,) = read_parts(path, 1.0, "hull", "cell", **MOST)
+    assert ConvexHull(part).volume == pytest.approx(3.5)
+
+
+def test_a_mesh_of_a_cell_file_becomes_hulls_that_need_no_file(tmp_path: Path) -> None:
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
+    stl(tmp_path / "part.stl", *solid(corners))
+    read = cell(tmp_path, "[[objects]]\nname = 'part'\nshape = 'mesh'\nfile = 'part.stl'\nscale = 0.5\n")
+    (one,) = read.objects
+    assert one.shape == "hulls"
+    (tmp_path / "part.stl").unlink()
+    again = Cell.from_dict(json.loads(json.dumps(read.to_dict())))
+    ((points, radius),) = again.objects[0].parts()
+    assert radius == 0.0
+    assert sorted(points.tolist()) == sorted((0.5 * corners).tolist())
+
+
+def test_packed_and_unknown_files_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.stl").write_bytes(b"PK\x03\x04" + b"\0" * 100)
+    (tmp_path / "a.step").write_text("ISO-10303-21;")
+    (tmp_path / "b.stl").write_text("solid nothing\nendsolid nothing\n")
+    for name in ("a.stl", "a.step", "b.stl"):
+        with pytest.raises(SettingsError, match=name):
+            read_parts(tmp_path / name, 1.0, "refuse", "cell", **MOST)
+
+
+def test_an_object_has_what_its_shape_needs() -> None:
+    with pytest.raises(ValueError, match="no radius_m"):
+        CellObject(name="a", shape="sphere")
