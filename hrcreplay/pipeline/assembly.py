@@ -492,7 +492,14 @@ def planners(run_config: RunConfig, given: RunProgramme, start_ns: int) -> dict[
 def recorded_motion(
     run_config: RunConfig, model: RobotModel, joints: RecordedJoints, static: StaticObstacles | None
 ) -> RecordedMotion:
-    """Makes the robot as recorded, beside the volumes of the run."""
+    """Makes the robot as recorded, beside the volumes of the run.
+
+    Args:
+        run_config: The run.
+        model: The robot.
+        joints: Its recorded joints.
+        static: What it is measured against beside people; None: nothing.
+    """
     settings = plan_settings(run_config, 1.0 / run_config.settings.fusion.rate_hz, RECORDED)
     return RecordedMotion(model, joints, settings, static)
 
