@@ -20,6 +20,7 @@ from hrcreplay.live.control import session_controller
 from hrcreplay.live.record import codec
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.task import parse_task
+from hrcreplay.logs.motion_files import ImportMapping
 from hrcreplay.settings.listing import as_toml
 from hrcreplay.settings.load import Settings, load_settings
 from hrcreplay.settings.sections import Live
@@ -129,6 +130,8 @@ def test_toml_is_accepted(page: Path, body: str, tmp_path: Path) -> None:
         assert Cell.from_dict(table).watched is not None
     elif "waypoints" in table:
         assert parse_task(table, "block").waypoints
+    elif "columns" in table:
+        assert validate(ImportMapping, table, path).columns
     else:
         assert load_settings(path) != Settings() or body == as_toml()  # the list of all of them
 

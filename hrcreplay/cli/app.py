@@ -78,18 +78,34 @@ def info(
 
 @app.command(name="import")
 def import_(
-    kind: Annotated[str, typer.Argument(metavar="KIND", help="azure, kinect2 or keraal.")],
+    kind: Annotated[
+        str,
+        typer.Argument(
+            metavar="KIND",
+            help="azure, kinect2, keraal, table, mediapipe, openpose, k4abt, zed, trc, c3d, bvh, optitrack, mvnx, ntu, "
+            "chico or harper.",
+        ),
+    ],
     files: Annotated[
         list[str],
         typer.Argument(metavar="[CAMERA=]FILE...", help="One file per camera; keraal: Kinect text, then optical text."),
     ],
     out: Annotated[Path, typer.Option("--out", metavar="LOG.mcap", help="Log to write.")],
-    rate: Annotated[float, typer.Option("--rate", metavar="HZ", help="keraal: rate of the Kinect, in Hz.")] = 30.0,
+    rate: Annotated[
+        float | None,
+        typer.Option(
+            "--rate", metavar="HZ", help="Rate of files that do not tell theirs, in Hz; keraal: 30 by default."
+        ),
+    ] = None,
+    mapping: Annotated[
+        Path | None,
+        typer.Option("--mapping", metavar="FILE.toml", help="Description of the files: columns, points, unit, axes."),
+    ] = None,
 ) -> None:
-    """Make a log from Azure Kinect CSV, Kinect v2 CSV or KERAAL text files."""
+    """Make a log from files of trackers, motion capture systems and research sets."""
     from hrcreplay.commands import inputs
 
-    for note in inputs.import_files(kind, files, out, rate):
+    for note in inputs.import_files(kind, files, out, rate, mapping):
         sys.stderr.write(f"hrcreplay: {note}\n")
     sys.stdout.write(f"{out}\n")
 

@@ -12,12 +12,15 @@ from hrcreplay.calibration import calibrate as calibration
 from hrcreplay.calibration.cell import Cell, load_cell, pose_from_position, write_cell
 from hrcreplay.errors import SettingsError
 from hrcreplay.logs import importers, info
+from hrcreplay.logs.motion_files import ImportMapping, import_motion
 from hrcreplay.logs.reader import open_log
 from hrcreplay.pipeline.run_config import robot_axes
 from hrcreplay.settings.load import load_settings
+from hrcreplay.toml_file import read_toml, validate
 
-#: Kinds of text files that ``import`` reads.
-KINDS = ("azure", "kinect2", "keraal")
+#: Kinds of files that ``import`` reads with functions of their own; the others are ``formats.FORMATS``.
+_OWN_KINDS = ("azure", "kinect2", "keraal")
+_KERAAL_HZ = 30.0
 
 
 def describe(path: Path, config: Path | None, overrides: tuple[str, ...], cell_file: Path | None = None) -> list[str]:
@@ -47,28 +50,49 @@ def describe(path: Path, config: Path | None, overrides: tuple[str, ...], cell_f
     return info.lines(summary)
 
 
-def import_files(kind: str, files: list[str], out: Path, rate_hz: float) -> list[str]:
-    """Makes a log from text files; returns notes for the user.
+def import_files(
+    kind: str, files: list[str], out: Path, rate_hz: float | None = None, mapping: Path | None = None
+) -> list[str]:
+    """Makes a log from files of other programs; returns notes for the user.
 
     Args:
-        kind: azure, kinect2 or keraal.
+        kind: azure, kinect2, keraal or one of ``formats.FORMATS``.
         files: ``[camera=]path``, one per camera; for keraal the Kinect's file and, optionally, the optical one.
         out: Log to write.
-        rate_hz: Frames a second of the Kinect, keraal only [Hz].
+        rate_hz: Frames a second of files that do not tell; None: as in the file, 30 for keraal [Hz].
+        mapping: TOML file with a description of the files, as in ``motion_files.ImportMapping``; None: none.
 
     Raises:
-        SettingsError: The kind is unknown, there are too many files, a camera is given twice, or ``out`` exists.
+        SettingsError: The kind is unknown, there are too many files, a camera is given twice, ``out`` exists, or the
+            mapping cannot be used.
         LogError: A file cannot be read.
     """
-    if kind not in KINDS:
-        raise SettingsError(f"import: found {kind!r}; would be right: {', '.join(KINDS)}")
+    from hrcreplay.logs.formats import FORMATS  # slow to load
+
+    if kind not in (*_OWN_KINDS, *FORMATS):
+        raise SettingsError(f"import: found {kind!r}; would be right: {', '.join((*_OWN_KINDS, *FORMATS))}")
+    if kind in FORMATS:
+        return import_motion(FORMATS[kind], _by_camera(files), out, _mapping(kind, mapping, rate_hz))
+    if mapping is not None:
+        raise SettingsError(f"import {kind}: found --mapping; would be right: without, or one of {', '.join(FORMATS)}")
     if kind == "keraal":
         if len(files) > 2:
             raise SettingsError(f"import keraal: found {len(files)} files; give the Kinect's, then the optical one")
         paths = [Path(file) for file in files]
+        rate_hz = _KERAAL_HZ if rate_hz is None else rate_hz
         return importers.import_keraal(paths[0], paths[1] if len(paths) > 1 else None, out, rate_hz)
     make = importers.import_azure if kind == "azure" else importers.import_kinect2
     return make(_by_camera(files), out)
+
+
+def _mapping(kind: str, path: Path | None, rate_hz: float | None) -> ImportMapping:
+    """Returns the description of the files: that of the mapping file, with the rate of the command line."""
+    if path is None and kind == "table":
+        raise SettingsError("import table: found no description of the table; give one with --mapping FILE.toml")
+    table = {} if path is None else read_toml(path, "name a TOML file")
+    if rate_hz is not None:
+        table["rate_hz"] = rate_hz
+    return validate(ImportMapping, table, "--rate" if path is None else path)
 
 
 def _by_camera(files: list[str]) -> dict[str, Path]:

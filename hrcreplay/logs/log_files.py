@@ -38,11 +38,20 @@ from hrcreplay.logs.ros_bags import Db3Stream, open_bag
 from hrcreplay.logs.unpack import ZSTD_MAGIC, unpack_file
 from hrcreplay.records import Floats, Ints, Table
 
-_TABLES = ("csv", "tsv", "txt")  # endings of files for the importers
+#: Endings of files for ``import`` -> the kinds that may read them.
+_IMPORTED = {
+    **dict.fromkeys(("csv", "tsv", "txt"), "azure|kinect2|keraal|table|mediapipe|optitrack"),
+    **dict.fromkeys(("parquet", "jsonl"), "table"),
+    "json": "table|mediapipe|openpose|k4abt|zed",
+    "skeleton": "ntu",
+    "pkl": "chico|harper",
+    **{kind: kind for kind in ("trc", "c3d", "bvh", "mvnx")},
+}
+_BINARY = ("parquet", "c3d", "pkl")
 _SQLITE = b"SQLite format 3\0"
 _KNOWN = "known are MCAP files, ROS 1 bags (.bag) and ROS 2 bags (a folder with metadata.yaml, or a .db3 file)"
 
-_IMPORT = ". It is text: hrcreplay import azure|kinect2|keraal {path} --out LOG.mcap makes a log of a tracker's CSV"
+_IMPORT = ". hrcreplay import {kinds} {path} --out LOG.mcap makes a log of it"
 
 
 @dataclass
@@ -140,7 +149,8 @@ def _file(path: Path) -> MessageStream:
         return open_bag(path)
     if head.startswith(_SQLITE) and path.suffix == ".db3":
         return Db3Stream(path)
-    text = _IMPORT.format(path=path) if _is_text(path) else ""
+    kinds = _IMPORTED.get(_ending(path))
+    text = _IMPORT.format(path=path, kinds=kinds) if kinds and (_ending(path) in _BINARY or _is_text(path)) else ""
     raise LogError(f"{path}: is no log of a known kind; {_KNOWN}{text}")
 
 
@@ -153,10 +163,12 @@ def _unpacked(source: LogFiles, file: Path) -> Path:
     return unpack_file(file, Path(source.folder.name) / file.stem)
 
 
+def _ending(path: Path) -> str:
+    return path.name.lower().removesuffix(".gz").rpartition(".")[2]
+
+
 def _is_text(path: Path) -> bool:
-    """Returns True if a file may be a tracker's table: by its name, and by text at its start, plain or gzipped."""
-    if path.name.lower().removesuffix(".gz").rpartition(".")[2] not in _TABLES:
-        return False
+    """Returns True if a file has text at its start, plain or gzipped."""
     try:
         with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
             head = file.read(4096)

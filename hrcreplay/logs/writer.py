@@ -175,7 +175,7 @@ def _refuse_existing(path: Path) -> None:
 START_NS = 1_000_000_000
 
 #: Note on every format imported here: none contains the arrival time of a frame at a computer.
-_ARRIVAL_NOTE = "the files hold capture times only: arrival is taken as capture, as if there were no delay"
+ARRIVAL_NOTE = "the files hold capture times only: arrival is taken as capture, as if there were no delay"
 
 _CHUNK = 256  # number of rows written at once
 
@@ -193,8 +193,12 @@ class ImportedSkeleton(NamedTuple):
 _LINE_CHARACTERS = 1 << 20
 
 
-def lines(path: Path) -> Iterator[tuple[str, str]]:
+def lines(path: Path, *, strip: bool = True) -> Iterator[tuple[str, str]]:
     """Yields lines of a text file, plain or gzipped, each with its position ``file:line``. Blank lines are skipped.
+
+    Args:
+        path: The file.
+        strip: False: keep the blanks at both ends of a line, which are empty columns.
 
     Raises:
         LogError: The file is missing, is not text, or is empty.
@@ -206,7 +210,7 @@ def lines(path: Path) -> Iterator[tuple[str, str]]:
                 if len(text) == _LINE_CHARACTERS:
                     raise LogError(f"{path}:{number}: a line of over 1 MB; would be right: one row a frame")
                 if text.strip():
-                    yield f"{path}:{number}", text.strip()
+                    yield f"{path}:{number}", text.strip() if strip else text.rstrip("\r\n")
     except FileNotFoundError as error:
         raise LogError(f"{path}: no such file; name a recording") from error
     except UnicodeDecodeError as error:
@@ -393,7 +397,7 @@ def import_cameras(
     units = {name: time_unit_ns(path, _first_column(path, separator), own_ns) for name, path in paths.items()}
     spans = write_log({name: read(path, units[name]) for name, path in paths.items()}, out)
     told = [note for name, unit in units.items() if (note := time_unit_note(name, unit, own_ns)) is not None]
-    return [_ARRIVAL_NOTE, *told, *_overlap_notes(spans)]
+    return [ARRIVAL_NOTE, *told, *overlap_notes(spans)]
 
 
 def _first_column(path: Path, separator: str) -> Iterator[str]:
@@ -402,7 +406,7 @@ def _first_column(path: Path, separator: str) -> Iterator[str]:
         yield text.partition(separator)[0]
 
 
-def _overlap_notes(spans: Mapping[str, tuple[int, int]]) -> list[str]:
+def overlap_notes(spans: Mapping[str, tuple[int, int]]) -> list[str]:
     """Returns a note for every camera whose times lie completely outside the first one's."""
     names = list(spans)
     start, end = spans[names[0]]

@@ -135,7 +135,11 @@ BAD: dict[str, tuple[tuple[object, ...], int, str]] = {
     "span outside": (("fuse", DEMO, "--start", 90), 2, "nothing of the log is left; it lasts 60.0 s"),
     "start is no number": (("fuse", DEMO, "--start", "nan"), 2, "--start nan: would be right: seconds from the log's"),
     "end is endless": (("report", DEMO, "--end", "inf"), 2, "--end inf: would be right: seconds from the log's start"),
-    "text for a log": (("info", "people.csv"), 3, "hrcreplay import azure|kinect2|keraal people.csv --out LOG.mcap"),
+    "text for a log": (
+        ("info", "people.csv"),
+        3,
+        "hrcreplay import azure|kinect2|keraal|table|mediapipe|optitrack people.csv --out LOG.mcap",
+    ),
     "calibrate height": (
         ("calibrate", DEMO, "--out", "c.toml", "--height", "nan"),
         2,
