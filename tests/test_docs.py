@@ -18,12 +18,13 @@ from hrcreplay.egm.link import ALARMS, REFUSALS, STOPS, PacketStatus
 from hrcreplay.egm.robot_double.faults import KINDS, load_faults
 from hrcreplay.live.control import session_controller
 from hrcreplay.live.record import codec
+from hrcreplay.logs.motion_files import ImportMapping
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.task import parse_task
-from hrcreplay.logs.motion_files import ImportMapping
 from hrcreplay.settings.listing import as_toml
 from hrcreplay.settings.load import Settings, load_settings
 from hrcreplay.settings.sections import Live
+from hrcreplay.toml_file import validate
 
 ROOT = Path(__file__).parent.parent
 LIVE = ROOT / "docs" / "live.md"

@@ -138,6 +138,12 @@ def _rows(track: Tracks, points: Floats, confidence: Floats, shift_ns: int) -> I
 def body_points(track: Tracks, form: Format, mapping: ImportMapping, where: str) -> tuple[Floats, Floats, list[str]]:
     """Returns points (n, 20, 3) [m] and confidence (n, 20) of a file's bodies, and remarks.
 
+    Args:
+        track: Points of the file.
+        form: Its format.
+        mapping: Description of the file, which replaces what the format says.
+        where: File, for messages.
+
     Raises:
         LogError: None of its points is a body point, the body is no person, the unit is not known, or the points have
             no place.
@@ -267,7 +273,18 @@ def in_order(t_ns: Ints, where: str) -> Ints:
 
 
 def one_body(t_ns: Ints, names: tuple[str, ...], points: Floats, where: str, unit: str | None) -> Tracks:
-    """Returns the tracks of one body whose points (n, k, 3) have no confidence."""
+    """Returns the tracks of one body whose points have no confidence.
+
+    Args:
+        t_ns: (n,) times [ns].
+        names: k names of the points.
+        points: (n, k, 3), in ``unit``; NaN if missing.
+        where: File, for messages.
+        unit: Unit of the points; None: not known from the file.
+
+    Raises:
+        LogError: There is no frame, or the times go back.
+    """
     return Tracks(in_order(t_ns, where), np.zeros(len(t_ns), dtype=np.int64), names, points, seen(points), unit)
 
 
@@ -294,7 +311,19 @@ def empty_frame(t_ns: int, count: int) -> Body:
 def stacked(
     bodies: list[Body], names: tuple[str, ...], where: str, unit: str | None, *notes: str, order: str | None = None
 ) -> Tracks:
-    """Returns the tracks of bodies in the order of a file. Raises LogError if there is none."""
+    """Returns the tracks of bodies in the order of a file.
+
+    Args:
+        bodies: Bodies of all frames, in order of time.
+        names: k names of their points.
+        where: File, for messages.
+        unit: Unit of the points; None: not known from the file.
+        notes: Remarks for the user.
+        order: Order of the points; None: that of the format.
+
+    Raises:
+        LogError: There is no body, or the times go back.
+    """
     if not any(body.number != NOBODY for body in bodies):
         raise LogError(f"{where}: found no body; would be right: a recording of a person")
     return Tracks(
