@@ -75,7 +75,9 @@ def answers(run: Run, metrics: Mapping[str, Metric]) -> tuple[Answer, ...]:
         stage = "predicted what the person could reach" if run.occupancy is not None else "fused the cameras"
         words = f"This run {stage} and moved no robot. Run plan or report on the same log to have it answered."
         return (Answer(SAFE, "Not asked in this run.", words), Answer(COST, "Not asked in this run.", ""))
-    ran = () if run.recorded is None or run.contact is None else (Answer(RAN, *verdict.answer_as_it_ran(metrics)),)
+    ran: tuple[Answer, ...] = ()
+    if run.recorded is not None and run.contact is not None:
+        ran = (Answer(RAN, verdict.in_short_as_it_ran(metrics), verdict.detailed_as_it_ran(metrics)),)
     return (*ran, _with_unmeasured(_safety(run, metrics), metrics), _cost(run, metrics))
 
 

@@ -335,47 +335,56 @@ _ROLES = {"plan": " (this plan)", RECORDED: " (as it ran)"}
 
 
 def _as_it_ran(run: Run, metrics: Metrics) -> tuple[str, ...]:
-    """Returns the answer for the robot as recorded in short; none without its joints."""
-    return () if run.recorded is None else answer_as_it_ran(metrics)[:1]
+    """Returns the answer for the robot as recorded, with what it covers; none without its joints."""
+    return () if run.recorded is None else (f"{in_short_as_it_ran(metrics)} {_covered_as_it_ran(metrics)}",)
 
 
-def answer_as_it_ran(metrics: Metrics) -> tuple[str, str]:
-    """Answers if the robot was safe as it ran: the short answer, and what it covers.
+def in_short_as_it_ran(metrics: Metrics) -> str:
+    """States if the robot was safe as it ran, at the ticks that ``detailed_as_it_ran`` names.
 
     Args:
         metrics: Metrics of a run with the robot as recorded.
     """
     touch, near = metrics["recorded_touch_moving_ticks"], metrics["recorded_body_distance_min_moving_m"]["value"]
     if touch["value"] is None:
-        short = "It is not known whether the robot touched anybody as it ran."
-    elif touch["value"]:
+        return "It is not known whether the robot touched anybody as it ran."
+    if touch["value"]:
         seconds, speed = (text_of(metrics[f"recorded_touch_{w}"]) for w in ("moving_s", "contact_speed_max_m_per_s"))
-        short = f"As it ran, the moving robot touched {_whom(metrics, RECORDED)}: {seconds}, up to {speed}."
-    elif near is None:
-        short = "As it ran, the robot did not move while anybody was known to be there."
-    else:
-        seen = _as_far_as(metrics)
-        short = f"As it ran{seen} the moving robot touched nobody: it kept {_centimetres(near)} away or more."
-    both, ticks = metrics["recorded_body_known_ticks"], metrics["recorded_ticks"]
-    judge = metrics["contact_person"]["value"]
-    words = [f"Robot and person are both known at {text_of(both)} of {text_of(ticks)} ticks, judged by the {judge}."]
-    if both["value"] != ticks["value"]:
-        words.append("The others were not looked at.")
-    unknown = {
-        n.removeprefix(_UNKNOWN): m["value"] for n, m in metrics.items() if n.startswith(_UNKNOWN) and m["value"]
-    }
-    if unknown:
-        parts = ", ".join(f"{reason.replace('_', ' ')} {count:,}" for reason, count in unknown.items())
-        words.append(f"The robot is not known at {_count(sum(unknown.values()))}: {parts}.")
+        return f"As it ran, the moving robot touched {_whom(metrics, RECORDED)}: {seconds}, up to {speed}."
+    if near is None:
+        return "As it ran, the robot did not move while anybody was known to be there."
+    kept = f"it kept {_centimetres(near)} away or more"
+    return f"As it ran{_as_far_as(metrics)} the moving robot touched nobody: {kept}."
+
+
+def detailed_as_it_ran(metrics: Metrics) -> str:
+    """States what ``in_short_as_it_ran`` covers, contacts at rest, and if the robot could have stopped in time."""
+    words = [_covered_as_it_ran(metrics)]
     if rest := metrics["recorded_touch_rest_ticks"]["value"]:
         words.append(f"At rest it was in contact at {_count(rest)}.")
     if moving := metrics["recorded_moving_ticks"]["value"]:
         late = metrics["recorded_contact_moving_ticks"]["value"]
         words.append(
-            f"At {late:,} of its {_count(moving)} in motion a link was where the person was predicted to reach before "
-            "it could have stopped.".replace(",", "\u202f")
+            f"At {_count(late)} of {moving:,} in motion a link was where the person was predicted to reach before it "
+            "could have stopped.".replace(",", "\u202f")
         )
-    return short, " ".join(words)
+    return " ".join(words)
+
+
+def _covered_as_it_ran(metrics: Metrics) -> str:
+    """Describes the ticks at which robot and person are both known, and all that was not looked at."""
+    known, both, ticks = (metrics[f"recorded_{name}"]["value"] for name in ("known_ticks", "body_known_ticks", "ticks"))
+    unknown = {n.removeprefix(_UNKNOWN): m["value"] for n, m in metrics.items() if n.startswith(_UNKNOWN)}
+    missing = []
+    if known < ticks:
+        why = ", ".join(f"{reason.replace('_', ' ')}: {count}" for reason, count in unknown.items() if count)
+        missing.append(f"{_count(ticks - known)} at which the robot is not known ({why})")
+    if both < known:
+        missing.append(f"{_count(known - both)} at which the person is not known")
+    missing += unseen_limbs(metrics)
+    left = f"; not looked at: {', '.join(missing)}" if missing else ""
+    which = f"the {both:,} of {ticks:,} ticks".replace(",", "\u202f") if both < ticks else "all ticks"
+    return f"Judged at {which} by the {metrics['contact_person']['value']}{left}."
 
 
 #: Prefix of the numbers of ticks at which the robot is not known, before the reason.

@@ -17,7 +17,7 @@ from hrcreplay.records import Bools, Floats, Ints, Table, find_neighbours
 #: A robot stands if no axis moves further than this [rad] within this time around an instant [s].
 REST_RAD, REST_S = 1e-3, 0.1
 #: Time over which a velocity is computed from positions, where the record has none [s].
-SLOPE_S = 0.02
+SLOPE_S = 0.05
 #: Reasons for which the robot is not known at an instant; the first one is for known instants.
 UNKNOWN = ("", "before the first joint state", "gap in the joint states", "after the last joint state")
 _KNOWN, _BEFORE, _GAP, _AFTER = range(4)

@@ -13,7 +13,7 @@ from typing import Any
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
-from hrcreplay.records import LIMBS
+from hrcreplay.records import LIMBS, RECORDED
 from hrcreplay.reporting import summary_text
 from hrcreplay.reporting.figures.catalogue import FIGURES
 from hrcreplay.reporting.metrics.fusion import cameras
@@ -186,6 +186,7 @@ def _plan(
 ) -> tuple[PageSection, ...]:
     """Makes the sections on the plan and its baselines: safety, and cost to the task."""
     plans = {"this plan": "plan", **{name: f"baseline_{name}" for name in sorted(run.baselines)}}
+    ran = {} if run.recorded is None else {"as recorded": RECORDED}
     planned = run.motion is not None
     no_plan = "" if planned else "Not in this run: it moved no robot. Run plan or report on the same log."
     return (
@@ -195,7 +196,7 @@ def _plan(
             "Speed of the robot, distance from the space that the person could reach, and constraints that slowed it.",
             _figures(figures_dir, "safety"),
             (
-                compare("Safety, per method on the same volumes", metrics, plans, PLAN_SAFETY),
+                compare("Safety, per method on the same volumes", metrics, ran | plans, PLAN_SAFETY),
                 *_reasons(metrics, plans),
                 *stops,
             )
