@@ -37,7 +37,7 @@ from hrcreplay.evaluation.containment import Outcome
 from hrcreplay.evaluation.recorded_person import RecordedPeople
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.pipeline import assembly, reuse, stages
-from hrcreplay.pipeline.assembly import Forecast
+from hrcreplay.pipeline.assembly import Follower, Forecast, Recorded
 from hrcreplay.pipeline.run_config import RunConfig, RunOptions, resolve
 from hrcreplay.pipeline.stages import ProgressBar, Sink, collect_plan_findings, print_note
 from hrcreplay.records import RECORDED, UNGUARDED, Floats, Ints
@@ -45,9 +45,8 @@ from hrcreplay.reporting import comparison
 from hrcreplay.reporting.comparison import Variant
 from hrcreplay.reporting.summary_text import defect_notes
 from hrcreplay.robot.control.controllers import Planner
-from hrcreplay.robot.control.recorded import RecordedMotion
 from hrcreplay.robot.model import RobotModel
-from hrcreplay.robot.recorded import RecordedJoints
+from hrcreplay.robot.recorded import RecordedCapsules
 from hrcreplay.robot.task import Reference
 from hrcreplay.settings.load import Settings
 from hrcreplay.settings.sections import Plan, Prediction
@@ -70,7 +69,7 @@ class PlacedProgramme:
     T_world_base: Floats  #: (4, 4)
     path: Reference
     start_s: float  #: programmed time at the first tick [s]
-    recorded: RecordedJoints | None  #: the robot as recorded; None: the log has no joints of this robot
+    recorded: Recorded | None  #: the robot as recorded; None: the log has no joints of this robot
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickles the programme without the robot; the other process makes the robot again."""
@@ -425,13 +424,15 @@ def plan(task: VariantTask, progress: Callable[[int], None] | None = None) -> tu
     predicted = Predicted(surroundings.prediction, states)
     own = compute_own_coverage(run_config, task.people, predicted, motion)
     full = None if task.variant.method in UNGUARDED else task.full
-    rows = contact_table(run_config, robot, task.variant.method, motion, task.people, predicted, own, full)
+    recorded = task.programme.recorded if task.variant.method == RECORDED else None
+    capsules = recorded if isinstance(recorded, RecordedCapsules) else None
+    rows = contact_table(run_config, robot, task.variant.method, motion, task.people, predicted, own, full, capsules)
     writer.table(f"contact_{slug}", rows)
     writer.close_tables()
     return done, time.perf_counter() - began_s
 
 
-def _planner(task: VariantTask, robot: RobotModel) -> Planner | RecordedMotion:
+def _planner(task: VariantTask, robot: RobotModel) -> Follower:
     """Makes the controller of the variant at the start of the programme, or the recorded motion."""
     run_config, programme = task.run_config, task.programme
     if task.variant.method == RECORDED and programme.recorded is not None:

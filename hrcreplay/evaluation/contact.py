@@ -27,8 +27,9 @@ from hrcreplay.pipeline import assembly, stages
 from hrcreplay.pipeline.assembly import PredictionStage
 from hrcreplay.pipeline.person_fuser import PersonFuser
 from hrcreplay.pipeline.run_config import RunConfig
-from hrcreplay.records import BODY, UNGUARDED, Bools, Floats, HumanStates, Ints, SweptVolume
+from hrcreplay.records import BODY, RECORDED, UNGUARDED, Bools, Floats, HumanStates, Ints, SweptVolume
 from hrcreplay.robot.model import LinkMotion, RobotModel
+from hrcreplay.robot.recorded import CapsuleSample, RecordedCapsules
 from hrcreplay.store.columns import Columns, body_columns, contact_columns, read_states, state_columns
 from hrcreplay.store.run_folder import RunWriter
 
@@ -106,7 +107,11 @@ def write_contact(run_config: RunConfig, log: Log, writer: RunWriter, T_world_ba
             shown_ns = motion["t_ns"].to_numpy()[:: max(1, round(run_config.settings.fusion.rate_hz / _BODY_HZ))]
             axes_m = body_axes(people.person, shown_ns, run_config.settings.prediction.hand_m)
             writer.table("body", body_columns(shown_ns, axes_m, PARTS))
-        writer.table("contact", contact_table(run_config, robot, method, motion, people, predicted, own, full))
+        capsules = None
+        if method == RECORDED and motion["q1"].isna().all():
+            capsules, _ = assembly.recorded_capsules(log, T_world_base)
+        rows = contact_table(run_config, robot, method, motion, people, predicted, own, full, capsules)
+        writer.table("contact", rows)
     writer.close_tables()
 
 
@@ -154,6 +159,7 @@ def contact_table(
     predicted: Predicted,
     own: Outcome | None,
     full: Outcome | None,
+    capsules: RecordedCapsules | None = None,
 ) -> Columns:
     """Computes the rows of contact.parquet for one motion.
 
@@ -166,10 +172,18 @@ def contact_table(
         predicted: Volumes of any tick.
         own: Result of ``compute_own_coverage``; None if not computed.
         full: Result of ``compute_full_coverage``; None if not computed.
+        capsules: The robot as recorded by its capsules, in place of the links of ``robot``; None: no such robot.
     """
     prediction, t_ns = run_config.settings.prediction, motion["t_ns"].to_numpy()
     radii_m = part_radii(prediction, run_config.settings.report.leg_radius_m)
-    person, other = nearest(robot, motion, (people.person, people.others), radii_m, prediction.hand_m)
+    groups, moving = (people.person, people.others), _is_turning(motion)
+    links = tuple(segment.name for segment in robot.segments)
+    if capsules is None:
+        person, other = nearest(robot, motion, groups, radii_m, prediction.hand_m)
+    else:
+        sample, links = capsules.sample(t_ns), capsules.names
+        moving = np.asarray(np.nan_to_num(sample.velocity).any(axis=(1, 2, 3)))
+        person, other = (nearest_capsule(sample, t_ns, tracks, radii_m, prediction.hand_m) for tracks in groups)
     worst, of_other = choose_nearer(person, other)
     outside_m = np.full(len(t_ns), np.nan)
     if method not in UNGUARDED:
@@ -179,10 +193,10 @@ def contact_table(
         t_ns=t_ns,
         method=method,
         person=people.source,
-        moving=_is_turning(motion),
+        moving=moving,
         distance_m=worst.distance_m,
         part=(worst.part, PARTS),
-        link=(worst.link, tuple(segment.name for segment in robot.segments)),
+        link=(worst.link, links),
         speeds=(motion["tcp_speed"].to_numpy(dtype=float), worst.speed),
         source=(np.where(of_other, len(people.person) + worst.track, worst.track), sources),
         apart=(person.distance_m, other.distance_m),
@@ -249,6 +263,36 @@ def _nearest(
         index = np.where(pair.first >= 0, k, -1)
         speed = links.speed(pair.first, at_m)
         found, _ = choose_nearer(found, Nearest(pair.distance_m, pair.first, pair.second, index, speed))
+    return found
+
+
+def nearest_capsule(
+    links: CapsuleSample, t_ns: Ints, tracks: Sequence[BodyTrack], radii_m: Floats, hand_m: float
+) -> Nearest:
+    """Finds the nearest pair of a recorded capsule and a body among some tracks, at every tick.
+
+    Args:
+        links: Capsules of the robot at the ticks.
+        t_ns: (n,) ticks [ns].
+        tracks: Bodies.
+        radii_m: (14,) radii of PARTS [m].
+        hand_m: Length of a hand beyond the wrist [m].
+    """
+    unknown, nothing = np.full(len(t_ns), np.nan), np.full(len(t_ns), -1)
+    found = Nearest(unknown, nothing, nothing, nothing, unknown)
+    for k, track in enumerate(tracks):
+        axes_m = track.axes_m(t_ns, hand_m)
+        for link in range(links.radius_m.shape[1]):
+            ends, radius_m = links.ends_m[:, link], links.radius_m[:, link]
+            pair = nearest_pair(ends[:, None], np.zeros(1), axes_m, radii_m)
+            along = ends[:, 1] - ends[:, 0]
+            length2 = np.maximum((along**2).sum(axis=1), 1e-18)
+            share = (((pair.at_first_m - ends[:, 0]) * along).sum(axis=1) / length2)[:, None]
+            velocity = (1 - share) * links.velocity[:, link, 0] + share * links.velocity[:, link, 1]
+            speed = np.linalg.norm(velocity, axis=1)
+            known = pair.first >= 0
+            index, which = np.where(known, link, -1), np.where(known, k, -1)
+            found, _ = choose_nearer(found, Nearest(pair.distance_m - radius_m, index, pair.second, which, speed))
     return found
 
 

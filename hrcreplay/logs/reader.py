@@ -12,6 +12,7 @@ import numpy as np
 
 from hrcreplay.errors import LogError
 from hrcreplay.logs import joints, log_files, messages, plausibility, presets
+from hrcreplay.logs.capsule_track import CapsuleTrack, find_capsules, read_capsules
 from hrcreplay.logs.cleaning import DEFECTS, STILL_M, STILL_S, Cleaner
 from hrcreplay.logs.clocks import ArrivalOrder, CameraClock, clock_remarks
 from hrcreplay.logs.decoders import (
@@ -251,6 +252,7 @@ class Log:
         self._topic_remarks = [*chosen.remarks, *poses.notes]
         self._options = options
         self._joint_topics = joints.find_topics(source, options.joints_topic)
+        self._capsules = find_capsules(source, options.robot_capsules)
         self._truth = log_files.truth_topic(source)
         self._reading: Counter[str] = Counter()
         self._remarks: list[str] = []
@@ -404,6 +406,17 @@ class Log:
         self._track.clear()
         self.joint_notes = ()
         return joints.read_topics(self._source, self._joint_topics, self._track)
+
+    def capsules(self) -> CapsuleTrack | None:
+        """Returns the capsules of the recorded robot, in the frame of its base; None without them.
+
+        Raises:
+            LogError: The messages do not have the fields of ``logs.robot_capsules``.
+        """
+        if self._capsules is None:
+            return None
+        self._track.clear()
+        return read_capsules(self._source, self._capsules, self._track)
 
     def truth(self) -> Iterator[Truth]:
         """Yields the true person in order of time, in chunks of at most 1 s; nothing without ground truth."""

@@ -21,6 +21,7 @@ from hrcreplay.human.fusion import inverse_kinematics
 from hrcreplay.human.fusion.vacancy import WatchedArea
 from hrcreplay.human.model import LimitSet
 from hrcreplay.human.prediction import swept_volumes
+from hrcreplay.logs.capsule_track import CapsuleTrack
 from hrcreplay.logs.cleaning import PersonMemory, select_person
 from hrcreplay.logs.joints import JointTrack
 from hrcreplay.logs.log_files import Header
@@ -42,12 +43,12 @@ from hrcreplay.robot.control.border import Border
 from hrcreplay.robot.control.control_step import PlanSettings
 from hrcreplay.robot.control.controllers import CONTROLLERS, Controller, Planner, Predict
 from hrcreplay.robot.control.programme_check import check_programme
-from hrcreplay.robot.control.recorded import RecordedMotion
+from hrcreplay.robot.control.recorded import RecordedCapsuleMotion, RecordedMotion
 from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.robot.control.static_obstacles import StaticHull, StaticObstacles, half_space
 from hrcreplay.robot.model import RobotModel, Segment, from_urdf, irb140
 from hrcreplay.robot.path import check_recorded, plan_programme, recorded_remarks, smooth_recorded
-from hrcreplay.robot.recorded import RecordedJoints, time_cut_ns, waiting_remarks
+from hrcreplay.robot.recorded import RecordedCapsules, RecordedJoints, time_cut_ns, waiting_remarks
 from hrcreplay.robot.task import Reference, Task, parse_task
 from hrcreplay.settings.sections import Fusion, Prediction, Robot
 
@@ -243,6 +244,9 @@ class LogLike(Protocol):
     def joints(self, axes: Sequence[str], /) -> JointTrack | None:
         """The recorded track of the robot's axes, if there is one."""
 
+    def capsules(self) -> CapsuleTrack | None:
+        """The capsules of the recorded robot's links, if there are any."""
+
 
 def fusion_stage(run_config: RunConfig, log: LogLike) -> FusionStage:
     """Makes stage 1 of a run. A camera pose of the cell file has priority over the log's.
@@ -362,6 +366,12 @@ def _robot(settings: Robot, files: UrdfFiles | None, stop_s: float, T_world_base
     )
 
 
+#: What gives the motion of a method.
+Follower = Planner | RecordedMotion | RecordedCapsuleMotion
+#: The robot as recorded.
+Recorded = RecordedJoints | RecordedCapsules
+
+
 @dataclass(frozen=True)
 class RunProgramme:
     """The programmed path of a run, and the robot as recorded."""
@@ -370,7 +380,7 @@ class RunProgramme:
     notes: tuple[str, ...]  #: for the user
     begin_ns: int | None = None  #: instant at which the path starts, if the log gives one [ns]
     cuts_ns: tuple[tuple[int, int], ...] = ()  #: spans of the record that are not in the path [ns]
-    recorded: RecordedJoints | None = None  #: None: the log has no joints of this robot
+    recorded: Recorded | None = None  #: None: the log has neither joints of this robot nor capsules of one
 
     def start_s(self, start_ns: int) -> float:
         """Programmed time at the first tick [s]."""
@@ -421,10 +431,23 @@ def _recorded(track: JointTrack, model: RobotModel) -> RecordedJoints:
     return RecordedJoints(t_ns, q, track.dq, track.gaps_ns)
 
 
-def _recorded_beside_task(log: LogLike, model: RobotModel) -> tuple[RecordedJoints | None, tuple[str, ...]]:
-    """Returns the robot as recorded in a log whose programme is a task, with remarks; None without joints that fit."""
-    if not log.header.joint_topics:
+def recorded_capsules(log: LogLike, T_world_base: Floats) -> tuple[RecordedCapsules | None, tuple[str, ...]]:
+    """Returns the capsules of the recorded robot, with remarks; None without them.
+
+    Raises:
+        LogError: The messages do not have the fields of ``logs.robot_capsules``.
+    """
+    track = log.capsules()
+    if track is None:
         return None, ()
+    numbers = RecordedJoints(track.numbers.t_ns, track.numbers.q, track.numbers.dq, track.numbers.gaps_ns)
+    return RecordedCapsules(numbers, track.names, T_world_base), track.notes
+
+
+def _recorded_beside_task(log: LogLike, model: RobotModel) -> tuple[Recorded | None, tuple[str, ...]]:
+    """Returns the robot as recorded in a log whose programme is a task, with remarks; None if it does not fit."""
+    if not log.header.joint_topics:
+        return recorded_capsules(log, model.T_world_base)
     try:
         track = log.joints(model.joint_names)
         return (None, ()) if track is None else (_recorded(track, model), log.joint_notes)
@@ -490,31 +513,33 @@ def planners(run_config: RunConfig, given: RunProgramme, start_ns: int) -> dict[
 
 
 def recorded_motion(
-    run_config: RunConfig, model: RobotModel, joints: RecordedJoints, static: StaticObstacles | None
-) -> RecordedMotion:
-    """Makes the robot as recorded, beside the volumes of the run.
+    run_config: RunConfig, model: RobotModel, recorded: Recorded, static: StaticObstacles | None
+) -> RecordedMotion | RecordedCapsuleMotion:
+    """Makes the motion of the robot as recorded, beside the volumes of the run.
 
     Args:
         run_config: The run.
-        model: The robot.
-        joints: Its recorded joints.
-        static: What it is measured against beside people; None: nothing.
+        model: The robot of the settings.
+        recorded: The robot as recorded.
+        static: What its joints are measured against beside people; None: nothing.
     """
+    if isinstance(recorded, RecordedCapsules):
+        return RecordedCapsuleMotion(model, recorded)
     settings = plan_settings(run_config, 1.0 / run_config.settings.fusion.rate_hz, RECORDED)
-    return RecordedMotion(model, joints, settings, static)
+    return RecordedMotion(model, recorded, settings, static)
 
 
-def followers(run_config: RunConfig, given: RunProgramme, start_ns: int) -> dict[str, Planner | RecordedMotion]:
+def followers(run_config: RunConfig, given: RunProgramme, start_ns: int) -> dict[str, Follower]:
     """Makes all motions of a run: the chosen method, its baselines and, with joints in the log, the recorded robot."""
     planned = planners(run_config, given, start_ns)
-    found: dict[str, Planner | RecordedMotion] = {**planned}
+    found: dict[str, Follower] = {**planned}
     if given.recorded is not None:
         static = next(iter(planned.values())).static
         found[RECORDED] = recorded_motion(run_config, given.path.model, given.recorded, static)
     return found
 
 
-def scene_notes(moved: Mapping[str, Planner | RecordedMotion]) -> tuple[str, ...]:
+def scene_notes(moved: Mapping[str, Follower]) -> tuple[str, ...]:
     """Returns notes on what the robots of a run keep clear of beside people."""
     static = next(iter(moved.values())).static
     return () if static is None else static.notes

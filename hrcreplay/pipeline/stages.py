@@ -24,7 +24,7 @@ from hrcreplay.human.fusion import fuse, inverse_kinematics, vacancy
 from hrcreplay.logs.camera_checks import CameraChecks
 from hrcreplay.logs.clocks import delay_text
 from hrcreplay.logs.reader import Log
-from hrcreplay.pipeline.assembly import Forecast, FusionStage, PredictionStage, Surroundings
+from hrcreplay.pipeline.assembly import Follower, Forecast, FusionStage, PredictionStage, Surroundings
 from hrcreplay.pipeline.person_fuser import PersonFuser
 from hrcreplay.pipeline.run_config import RunConfig
 from hrcreplay.records import (
@@ -38,8 +38,6 @@ from hrcreplay.records import (
     SkeletonTrack,
     SweptVolumes,
 )
-from hrcreplay.robot.control.controllers import Planner
-from hrcreplay.robot.control.recorded import RecordedMotion
 from hrcreplay.robot.control.static_obstacles import nearest
 from hrcreplay.settings.sections import Fusion
 from hrcreplay.store.columns import (
@@ -423,7 +421,7 @@ def predict_batches(
 def plan_batches(
     states: Iterable[HumanStates],
     surroundings: Surroundings,
-    planners: Mapping[str, Planner | RecordedMotion],
+    planners: Mapping[str, Follower],
     store_every: float,
     sink: Sink,
 ) -> Iterator[None]:
@@ -460,7 +458,7 @@ def plan_batches(
         yield
 
 
-def nearest_columns(planner: Planner | RecordedMotion, motion: Motion) -> dict[str, Any]:
+def nearest_columns(planner: Follower, motion: Motion) -> dict[str, Any]:
     """Returns the columns of the nearest objects and links; none if the cell has no objects."""
     static = planner.static
     if static is None:

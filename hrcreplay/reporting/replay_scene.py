@@ -221,6 +221,8 @@ def replay_scene(run: Run, robot: RobotModel, t0_ns: int, radii_m: Mapping[str, 
     parts = tuple(part for part in radii_m if run.body is not None and f"{part}_0_x" in run.body)
     prefixes = sorted(method_prefixes(run).items(), key=lambda pair: pair[1] != "plan")
     tables = {method: motion_of(run, prefix) for method, prefix in prefixes}
+    if RECORDED in tables and not tables[RECORDED]["q1"].notna().any():  # its joints are not recorded
+        del tables[RECORDED]
     slow = float(setting(run.meta.get("settings", {}), "report", "stationary_m_per_s"))
     return ReplayScene(
         t0_ns=t0_ns,

@@ -362,12 +362,14 @@ def detailed_as_it_ran(metrics: Metrics) -> str:
     words = [_covered_as_it_ran(metrics)]
     if rest := metrics["recorded_touch_rest_ticks"]["value"]:
         words.append(f"At rest it was in contact at {_count(rest)}.")
-    if moving := metrics["recorded_moving_ticks"]["value"]:
-        late = metrics["recorded_contact_moving_ticks"]["value"]
+    late, known = (metrics[f"recorded_{name}_moving_ticks"] for name in ("contact", "separation"))
+    if late["value"] is not None:
         words.append(
-            f"At {_count(late)} of {moving:,} in motion a link was where the person was predicted to reach before it "
-            "could have stopped.".replace(",", "\u202f")
+            f"At {_count(late['value'])} of {text_of(known)} in motion with a known prediction, a link was where the "
+            "person was predicted to reach before it could have stopped."
         )
+    elif metrics["recorded_moving_ticks"]["value"]:
+        words.append("Whether it could have stopped before it reached the person is not known.")
     return " ".join(words)
 
 

@@ -19,7 +19,7 @@ REST_RAD, REST_S = 1e-3, 0.1
 #: Time over which a velocity is computed from positions, where the record has none [s].
 SLOPE_S = 0.05
 #: Reasons for which the robot is not known at an instant; the first one is for known instants.
-UNKNOWN = ("", "before the first joint state", "gap in the joint states", "after the last joint state")
+UNKNOWN = ("", "before the first robot state", "gap in the robot states", "after the last robot state")
 _KNOWN, _BEFORE, _GAP, _AFTER = range(4)
 
 #: Time before and after a standstill over which the directions of motion are compared [s], the smallest way there
@@ -141,6 +141,36 @@ class RecordedJoints(Table):
         for begin, end in cuts_ns:
             kept &= (self.t_ns <= begin) | (self.t_ns >= end)
         return np.array([t - time_cut_ns(cuts_ns, t) for t in self.t_ns[kept].tolist()], dtype=np.int64), self.q[kept]
+
+
+class CapsuleSample(NamedTuple):
+    """Capsules of the robot's links at some instants, in the world."""
+
+    ends_m: Floats  #: (m, s, 2, 3) NaN where not known
+    velocity: Floats  #: (m, s, 2, 3) of the ends; 0 while the robot stands [m/s]
+    radius_m: Floats  #: (m, s)
+    reason: Ints  #: (m,) index into ``UNKNOWN``
+
+
+@dataclass(frozen=True)
+class RecordedCapsules:
+    """The robot as recorded by the capsules of its links: no joints, so neither limits nor stops."""
+
+    numbers: RecordedJoints  #: ``q`` (n, 7 s): for each capsule both ends in the frame of the base, and the radius [m]
+    names: tuple[str, ...]  #: (s,)
+    T_world_base: Floats  #: (4, 4)
+
+    def sample(self, at_ns: Ints) -> CapsuleSample:
+        """Capsules at some instants; between two rows the ends move on straight lines.
+
+        Args:
+            at_ns: (m,) [ns].
+        """
+        found = self.numbers.sample(at_ns)
+        q, dq = (values.reshape(len(at_ns), len(self.names), 7) for values in (found.q, found.dq))
+        R, at_m = self.T_world_base[:3, :3], self.T_world_base[:3, 3]
+        ends, velocity = (values[:, :, :6].reshape(len(at_ns), -1, 2, 3) @ R.T for values in (q, dq))
+        return CapsuleSample(ends + at_m, velocity, q[:, :, 6], found.reason)
 
 
 def time_cut_ns(cuts_ns: Sequence[tuple[int, int]], until_ns: int) -> int:

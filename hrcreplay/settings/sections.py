@@ -115,6 +115,23 @@ def is_rotation(axes: tuple[Axis, Axis, Axis]) -> bool:
     return even == (sum(axis.startswith("-") for axis in axes) % 2 == 0)
 
 
+class RobotCapsules(Section):
+    """Decoder of a robot that is recorded by the capsules of its links, in the frame of its base [m]."""
+
+    topic: str
+    """Topic of the messages."""
+    capsules: str = "capsules.capsules"
+    """Path to the array of capsules in the message, fields joined by dots."""
+    start: str = "p1"
+    """Field of a capsule: one end of its axis, with x, y, z."""
+    end: str = "p2"
+    """Field of a capsule: the other end; that of the last capsule is the TCP."""
+    radius: str = "r"
+    """Field of a capsule: its radius."""
+    stamp: str | None = "header.stamp"
+    """Path to the time of the message; "none": the arrival time."""
+
+
 class Logs(Section):
     """Reading logs."""
 
@@ -141,6 +158,9 @@ class Logs(Section):
     """Unit of the joint positions."""
     joints_offset_s: Annotated[float, Field(ge=-4e9, le=4e9)] | None = None
     """The robot's clock minus the log's; none: 0, or estimated if the stamps are clearly from another clock [s]."""
+    robot_capsules: RobotCapsules | None = None
+    """Capsules of the recorded robot, used if the log has no joints of the robot; none: those of a topic of the type
+    reachable_occupancy/ReachableOccupancy."""
     person_jump_m: Positive = 0.8
     """A body further than this from the person's last position is another person [m]."""
     person_memory_s: Positive = 2.0

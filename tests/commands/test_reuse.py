@@ -40,6 +40,7 @@ STALE = {
     "logs.joint_names": "plan",
     "logs.joints_unit": "plan",
     "logs.joints_offset_s": "plan",
+    "logs.robot_capsules": ALL,
     "logs.person_jump_m": ALL,
     "logs.person_memory_s": ALL,
     "logs.gap_s": "fuse",  # its counts
@@ -154,6 +155,7 @@ OTHER: dict[str, Any] = {
     "logs.joint_names": ("a", "b", "c", "d", "e", "f"),
     "logs.joints_unit": "deg",
     "logs.joints_offset_s": 0.5,
+    "logs.robot_capsules": {"topic": "/a"},
     "fusion.stale": "reuse",
     "fusion.delay": "ignore",
     "limits.tracking": "paper",

@@ -14,6 +14,7 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
 from hrcreplay.commands import compare, replay
@@ -23,16 +24,17 @@ from hrcreplay.human.model import part_radii
 from hrcreplay.logs.reader import open_log
 from hrcreplay.logs.writer import LogWriter
 from hrcreplay.pipeline import assembly
-from hrcreplay.pipeline.run_config import resolve
+from hrcreplay.pipeline.run_config import RunConfig, resolve
 from hrcreplay.records import Floats, HumanStates, Ints
 from hrcreplay.reporting import verdict
 from hrcreplay.robot import irb140
-from hrcreplay.robot.recorded import RecordedJoints
+from hrcreplay.robot.recorded import RecordedCapsules, RecordedJoints
 from hrcreplay.settings.sections import Settings
 from hrcreplay.store import run_folder
 from hrcreplay.store.columns import read_states
 from tests.facts import facts
 from tests.realdata import data_path
+from tests.test_recordings import SARA, SARA_CELL, TASK
 from tests.undrawn import undrawn
 
 SECOND = 1_000_000_000
@@ -162,8 +164,8 @@ def test_what_is_not_recorded_has_no_number_but_a_reason(ran: Ran) -> None:
     assert gap.sum() == 139
     assert after.sum() == 45
     reason = ran.recorded["reason"].to_numpy()
-    assert set(reason[gap]) == {"gap in the joint states"}
-    assert set(reason[after]) == {"after the last joint state"}
+    assert set(reason[gap]) == {"gap in the robot states"}
+    assert set(reason[after]) == {"after the last robot state"}
     for name in ("q1", "dq1", "tcp_x", "tcp_speed", "distance_m"):
         assert ran.recorded[name].isna().to_numpy()[gap | after].all()
     assert ran.recorded["q1"].notna().to_numpy()[~(gap | after)].all()
@@ -171,8 +173,8 @@ def test_what_is_not_recorded_has_no_number_but_a_reason(ran: Ran) -> None:
     assert not ran.contact["moving"].to_numpy()[gap | after].any()
 
 
-def people_of(folder: Path, log: Path) -> RecordedPeople:
-    run_config, opened = resolve("report", log), open_log(log)
+def people_of(folder: Path, run_config: RunConfig) -> RecordedPeople:
+    opened = open_log(run_config.log, run_config.settings.logs)
     states = HumanStates.join(list(read_states(folder / "state.parquet", 4096)))
     smooth = HumanStates.join(list(read_states(folder / "smooth.parquet", 4096)))
     return read_people(opened, states.t_ns, assembly.fusion_stage(run_config, opened), lambda: smooth)
@@ -190,7 +192,7 @@ def test_the_ticks_in_contact_are_those_of_brute_force(ran: Ran) -> None:
     """Link capsules by the URDF, at positions interpolated by numpy, against every recorded body by coal."""
     settings = Settings()
     radii_m = part_radii(settings.prediction, settings.report.leg_radius_m)
-    people = people_of(ran.folder, ran.log)
+    people = people_of(ran.folder, resolve("report", ran.log))
     t_ns = ran.recorded["t_ns"].to_numpy()
     shown = np.flatnonzero(ran.recorded["q1"].notna())
     shown = shown[(np.arange(len(shown)) % 9 == 0) | (np.abs(ran.contact["distance_m"].to_numpy()[shown]) < 0.12)]
@@ -225,14 +227,14 @@ def test_the_recorded_robot_is_told_first_and_its_unknown_ticks_with_it(ran: Ran
     assert metrics["recorded_touch_moving_ticks"]["value"] == touching > 40
     known = int(ran.recorded["q1"].notna().sum())
     assert metrics["recorded_known_ticks"]["value"] == known
-    assert metrics["recorded_unknown_ticks_gap_in_the_joint_states"]["value"] == 139
+    assert metrics["recorded_unknown_ticks_gap_in_the_robot_states"]["value"] == 139
     assert metrics["recorded_body_known_ticks"]["value"] <= known
     found = verdict.verdict(run, metrics)
     assert found is not None
     assert found.sentences[0].startswith("As it ran, the moving robot touched the person")
     assert found.table.rows[0][0] == "recorded (as it ran)"
     assert found.table.rows[1][0] == "scaling (this plan)"
-    assert "gap in the joint states: 139" in found.sentences[0]
+    assert "gap in the robot states: 139" in found.sentences[0]
     assert "Was it safe as it ran?" in (ran.folder / "report.html").read_text()
 
 
@@ -255,6 +257,7 @@ def recorded_of(log: Path, *overrides: str, **options: Any) -> tuple[RecordedJoi
     opened = open_log(run_config.log, run_config.settings.logs)
     model = assembly.robot(run_config, assembly.robot_base(run_config, opened))
     programme = assembly.programme(run_config, opened, model)
+    assert not isinstance(programme.recorded, RecordedCapsules)
     return programme.recorded, programme
 
 
@@ -342,3 +345,68 @@ def test_reported_logs_give_the_robot_of_the_right_one(name: str) -> None:
     known = found.reason == 0
     assert known.sum() == pytest.approx(len(at_ns) - (500 if name == "robot_gap2s" else 0), abs=1)
     assert_allclose(found.q[known], expected.q[known], atol=1e-6)
+
+
+def test_a_robot_recorded_by_its_capsules_is_judged_by_them(tmp_path: Path) -> None:
+    """A bag of others without joints: the TCP at each message, and the contacts by plain numpy over the messages.
+
+    The base is placed nearer to the person than it was, so that there are contacts.
+    """
+    bag = data_path("sara_human_robot_bags/exp_box.bag")
+    (tmp_path / "s.toml").write_text(SARA)
+    (tmp_path / "cell.toml").write_text(SARA_CELL.replace("[0, 0, 1.0]", "[0.1, 0.35, 1.0]"))
+    (tmp_path / "task.toml").write_text(TASK)
+    with undrawn():
+        folder = replay.run(
+            "report",
+            bag,
+            out=tmp_path / "run",
+            config=tmp_path / "s.toml",
+            cell_file=tmp_path / "cell.toml",
+            end_s=6.0,
+            overrides=(f"plan.task={tmp_path / 'task.toml'}", *FASTER),
+        )
+    with AnyReader([bag]) as reader:
+        sent: list[tuple[int, list[tuple[float, ...]]]] = []
+        for of, t_ns, raw in reader.messages([c for c in reader.connections if "robot" in c.topic]):
+            message: Any = reader.deserialize(raw, of.msgtype)
+            sent.append((t_ns, [(*_xyz(c.p1), *_xyz(c.p2), c.r) for c in message.capsules.capsules[:7]]))
+    at_ns, numbers = np.array([t_ns for t_ns, _ in sent]), np.array([row for _, row in sent])
+    motion = pq.read_table(folder / "motion_recorded.parquet").to_pandas()
+    contact = pq.read_table(folder / "contact.parquet").to_pandas()
+    contact = contact[contact["method"] == "recorded"]
+    assert motion["q1"].isna().all()
+    ticks_ns = motion["t_ns"].to_numpy()
+    base = np.array([0.1, 0.35, 1.0])
+    within = (ticks_ns >= aticks_ns[0]) & (ticks_ns <= aticks_ns[-1])
+    tip = np.column_stack([np.interp(ticks_ns, at_ns, numbers[:, 6, 3 + k]) + base[k] for k in range(3)])
+    assert np.abs(motion[["tcp_x", "tcp_y", "tcp_z"]].to_numpy()[within] - tip[within]).max() < 1e-4
+    run_config = resolve("report", bag, config=tmp_path / "s.toml", cell_file=tmp_path / "cell.toml", end_s=6.0)
+    people = people_of(folder, run_config)
+    settings = run_config.settings
+    radii_m = part_radii(settings.prediction, settings.report.leg_radius_m)
+    rows = np.flatnonzero(within)[::5]
+    shares = np.linspace(0.0, 1.0, 60)[:, None]
+    least = np.full(len(rows), np.inf)
+    for track in people.tracks:
+        axes = track.axes_m(ticks_ns[rows], settings.prediction.hand_m)
+        for i, row in enumerate(rows.tolist()):
+            for link in range(7):
+                n = [np.interp(ticks_ns[row], at_ns, numbers[:, link, k]) for k in range(7)]
+                a, b = np.array(n[:3]) + base, np.array(n[3:6]) + base
+                for part in np.flatnonzero(np.isfinite(axes[i]).all(axis=(1, 2))):
+                    c, d = axes[i, part]
+                    gaps = np.linalg.norm((a + shares * (b - a))[:, None] - (c + shares * (d - c))[None], axis=2)
+                    least[i] = min(least[i], gaps.min() - n[6] - radii_m[part])
+    found = contact["distance_m"].to_numpy()[rows]
+    clear = np.abs(least) > 2e-3  # sampled axes are up to this far from the nearest points
+    assert (least[clear] <= 0.0).sum() > 20
+    assert_array_equal((found <= 0.0)[clear], (least <= 0.0)[clear])
+    assert_allclose(found, least, atol=2e-3)
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert metrics["recorded_contact_moving_ticks"]["value"] is None
+    assert "not known" in (folder / "report.html").read_text()
+
+
+def _xyz(point: Any) -> tuple[float, float, float]:
+    return point.x, point.y, point.z

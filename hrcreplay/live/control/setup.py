@@ -25,6 +25,7 @@ from hrcreplay.live.control.stages import ControlSetup, Observer
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import Signal, TickEvent
 from hrcreplay.logs import skeleton_pb2
+from hrcreplay.logs.capsule_track import CapsuleTrack
 from hrcreplay.logs.joints import JointTrack
 from hrcreplay.logs.log_files import Header
 from hrcreplay.logs.reader import open_log
@@ -50,6 +51,10 @@ class HeaderOnlyLog:
 
     def joints(self, _axes: Sequence[str]) -> JointTrack | None:
         """None: a live robot follows a task."""
+        return None
+
+    def capsules(self) -> CapsuleTrack | None:
+        """None: a live robot is the one of the settings."""
         return None
 
 

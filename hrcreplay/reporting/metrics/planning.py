@@ -234,9 +234,9 @@ def _add_recorded(
     metrics: MetricTable, motion: pd.DataFrame, contact: pd.DataFrame | None, near_m: float, slow: float
 ) -> None:
     """Adds the metrics of the robot as recorded: of its known ticks only, and their number."""
-    what, known = method_text(RECORDED), np.isfinite(numeric_column(motion, "q1"))
+    what, known = method_text(RECORDED), np.isfinite(numeric_column(motion, "tcp_x"))
     metrics.add("recorded_ticks", len(motion), "1", f"ticks of {what}, known or not")
-    metrics.add("recorded_known_ticks", int(known.sum()), "1", f"ticks of {what} at which all its joints are known")
+    metrics.add("recorded_known_ticks", int(known.sum()), "1", f"ticks of {what} at which it is known")
     reasons = motion["reason"].astype(str).to_numpy()
     for reason in UNKNOWN[1:]:
         count = int((reasons[~known] == reason).sum())
@@ -245,13 +245,16 @@ def _add_recorded(
         )
     moving = is_moving(motion, slow)
     metrics.add("recorded_moving_ticks", int(moving.sum()), "1", f"ticks of {what} at which it moves")
-    within = numeric_column(motion, "distance_m") <= 0.0
+    distance_m = numeric_column(motion, "distance_m")[moving]
+    known_m = distance_m[np.isfinite(distance_m)]
+    metrics.add("recorded_separation_moving_ticks", len(known_m), "1", f"of those, ticks with a separation of {what}")
     metrics.add(
         "recorded_contact_moving_ticks",
-        int((within & moving).sum()),
+        int((known_m <= 0.0).sum()) if len(known_m) else None,
         "1",
         f"ticks of {what} at which it moves with a link in a place that the person was predicted to reach before it "
         "could have stopped",
+        reason="no separation is known: the person was not, or no joints are recorded, so the time of a stop is not",
     )
     _add_separation(metrics, RECORDED, motion, what, slow)
     rows = None if contact is None else contact[contact["method"] == RECORDED]

@@ -13,7 +13,7 @@ from hrcreplay.robot.control.control_step import REASONS, PlanSettings, RobotSta
 from hrcreplay.robot.control.controllers import Predict
 from hrcreplay.robot.control.static_obstacles import StaticObstacles
 from hrcreplay.robot.model import RobotModel
-from hrcreplay.robot.recorded import UNKNOWN, RecordedJoints
+from hrcreplay.robot.recorded import UNKNOWN, RecordedCapsules, RecordedJoints
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class RecordedMotion:
         """
         sample = self.joints.sample(t_ns)
         rows = [
-            self._without_numbers(UNKNOWN[reason]) if reason else self._row(q, dq, predict)
+            _without_numbers(self.robot.nv, UNKNOWN[reason]) if reason else self._row(q, dq, predict)
             for q, dq, reason, predict in zip(sample.q, sample.dq, sample.reason.tolist(), around, strict=True)
         ]
         links = tuple(segment.name for segment in self.robot.segments)
@@ -50,7 +50,7 @@ class RecordedMotion:
         stop = stop_straight(q, dq, self.robot.ddq_max, self.settings.dt_s)
         horizon_s = self.settings.horizon_s(stop)
         sight = observe(self.robot, RobotState(q, dq), predict(horizon_s), self.settings.plan.clearance_m)
-        return self._without_numbers(REASONS[sight.reason])._replace(
+        return _without_numbers(self.robot.nv, REASONS[sight.reason])._replace(
             q=q,
             dq=dq,
             tcp_m=sight.pose.T_world_tcp[:3, 3],
@@ -63,25 +63,57 @@ class RecordedMotion:
             tau_s=stop.ticks * self.settings.dt_s,
         )
 
-    def _without_numbers(self, reason: str) -> MotionRow:
-        """The row of a tick without any number."""
-        axes, point = np.full(self.robot.nv, math.nan), np.full(3, math.nan)
-        return MotionRow(
-            q=axes,
-            dq=axes,
-            u=axes,
-            ref_m=point,
-            tcp_m=point,
-            tcp_speed=math.nan,
-            ref_speed=math.nan,
-            programme_s=math.nan,
-            distance_m=math.nan,
-            overlap_m=math.nan,
-            limb=-1,
-            link=-1,
-            status=-1,
-            reason=reason,
-            horizon_s=math.nan,
-            tau_s=math.nan,
-            certified=False,
-        )
+
+#: Reason for which the distance from the volumes is not known where the record has no joints.
+NO_JOINTS = "no joints are recorded"
+
+
+@dataclass(frozen=True)
+class RecordedCapsuleMotion:
+    """Gives the motion of a robot that is recorded by its capsules: the TCP alone, the end of the last capsule."""
+
+    robot: RobotModel  #: the robot of the settings, which is another one
+    capsules: RecordedCapsules
+    static: None = None  #: it is not measured against objects
+    chosen: bool = False  #: it is never the run's method
+
+    def follow(self, t_ns: Ints, _around: Sequence[Predict], limbs: tuple[str, ...]) -> Motion:
+        """The recorded motion at a batch of ticks; without joints there are no stops, so no distance from volumes.
+
+        Args:
+            t_ns: (n,) ticks [ns].
+            _around: Not used.
+            limbs: Names of all possible volumes.
+        """
+        sample = self.capsules.sample(t_ns)
+        speed = np.linalg.norm(sample.velocity[:, -1, 1], axis=1).tolist()
+        rows = [
+            _without_numbers(self.robot.nv, UNKNOWN[reason] or NO_JOINTS)._replace(tcp_m=tcp_m, tcp_speed=tcp_speed)
+            for reason, tcp_m, tcp_speed in zip(sample.reason.tolist(), sample.ends_m[:, -1, 1], speed, strict=True)
+        ]
+        reasons = ("", *UNKNOWN[1:], NO_JOINTS)
+        return Motion.of_rows(t_ns, rows, limbs=limbs, links=self.capsules.names, reasons=reasons)
+
+
+def _without_numbers(axes: int, reason: str) -> MotionRow:
+    """The row of a tick without any number."""
+    joints, point = np.full(axes, math.nan), np.full(3, math.nan)
+    return MotionRow(
+        q=joints,
+        dq=joints,
+        u=joints,
+        ref_m=point,
+        tcp_m=point,
+        tcp_speed=math.nan,
+        ref_speed=math.nan,
+        programme_s=math.nan,
+        distance_m=math.nan,
+        overlap_m=math.nan,
+        limb=-1,
+        link=-1,
+        status=-1,
+        reason=reason,
+        horizon_s=math.nan,
+        tau_s=math.nan,
+        certified=False,
+    )
