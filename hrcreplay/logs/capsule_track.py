@@ -104,7 +104,7 @@ def _track(
     names = tuple(f"capsule {i}" for i in shown)
     note = (
         f"the robot as recorded: {len(names)} capsules on {topic}, without joints: contact is judged by them, but not "
-        "whether it could have stopped; another robot's task cannot be taken from them"
+        "whether it could have stopped; their motion is no programme for the robot of the settings"
     )
     return CapsuleTrack(reading.track, names, (note, *reading.notes))
 

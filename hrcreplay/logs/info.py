@@ -80,6 +80,7 @@ class Summary:
     base_from: str
     has_truth: bool
     joints: tuple[JointSummary, ...]
+    recorded: str  #: the robot as recorded, and what can be asked of it; empty without one
     defects: dict[str, int]
     bodies: tuple[BodyInWorld, ...]  #: heights of the person above the floor, for each camera of known pose
     agreements: tuple[LimbAgreement, ...]  #: agreement limb by limb, for each pair of such cameras
@@ -149,6 +150,7 @@ def summarize(
         _count(frames, tallies)
         person.add(frames)
     joint_topics, joint_notes = _joints(log, axes)
+    recorded = _recorded(log, joint_topics)
     cameras = tuple(
         _camera(name, tally, log, "the cell" if name in cell else "the log" if name in poses else "none")
         for name, tally in zip(header.cameras, tallies, strict=True)
@@ -165,6 +167,7 @@ def summarize(
         base_from="none" if base is None else "in the log" if T_world_base is None else "in the cell",
         has_truth=header.has_truth,
         joints=joint_topics,
+        recorded=recorded,
         defects=dict(log.defects),
         bodies=tuple(body for body in bodies if body.camera in poses),
         agreements=agreements,
@@ -242,6 +245,23 @@ def _joints(log: Log, axes: Sequence[str]) -> tuple[tuple[JointSummary, ...], tu
     ), notes
 
 
+def _recorded(log: Log, joint_topics: Sequence[JointSummary]) -> str:
+    """Describes the robot as recorded, and what can be asked of it; empty without one."""
+    axes = sum(len(topic.axes) for topic in joint_topics)
+    if axes:
+        whose = "its motion" if log.header.task is None else "the task"
+        return (
+            f"by {axes} joints: report and compare say first if it was safe as it ran, and beside it what each "
+            f"controller would have made of {whose}"
+        )
+    if not joint_topics and log.capsules_topic is not None:
+        return (
+            f"by capsules on {log.capsules_topic}: with a task for the robot of the settings, report and compare say "
+            "first if it was safe as it ran"
+        )
+    return ""
+
+
 def _count(frames: CameraFrames, tallies: list[_Tally]) -> None:
     rows = (frames.camera.tolist(), frames.capture_ns.tolist(), frames.arrival_ns.tolist(), frames.body.tolist())
     for camera, capture_ns, arrival_ns, body in zip(*rows, strict=True):
@@ -307,6 +327,7 @@ def lines(summary: Summary) -> list[str]:
         f"base     {summary.base_from}",
         f"truth    {'in the log' if summary.has_truth else 'none'}",
         *(["joints", *map(_joint_line, summary.joints)] if summary.joints else ["joints   none"]),
+        *([f"recorded {summary.recorded}"] if summary.recorded else []),
         f"person   {', '.join(_tall(camera) for camera in summary.cameras) or 'none'}",
     ]
     out += [f"sides    {', '.join(_sided(camera) for camera in summary.cameras) or 'none'}"]

@@ -407,6 +407,11 @@ class Log:
         self.joint_notes = ()
         return joints.read_topics(self._source, self._joint_topics, self._track)
 
+    @property
+    def capsules_topic(self) -> str | None:
+        """Topic of the capsules of the recorded robot; None without them."""
+        return None if self._capsules is None else self._capsules.topic
+
     def capsules(self) -> CapsuleTrack | None:
         """Returns the capsules of the recorded robot, in the frame of its base; None without them.
 

@@ -70,6 +70,13 @@ def test_lines_tell_it_all(tmp_path: Path) -> None:
     assert all("\n" not in line for line in text)
 
 
+def test_what_can_be_asked_of_the_robot_as_recorded_is_told(tmp_path: Path) -> None:
+    log = session(tmp_path / "a.mcap")
+    (line,) = (line for line in lines(summarize(open_log(log), axes=("a", "b"))) if line.startswith("recorded"))
+    assert tells([line], "by 2 joints", "report and compare", "as it ran", "of its motion")
+    assert not any(line.startswith("recorded") for line in lines(summarize(open_log(log), axes=("a", "c"))))
+
+
 def test_log_without_skeletons_is_described() -> None:
     found = summarize(open_log(data_path("ros_bags/example.bag"), skeletons=False))
     assert found.kind == "ros1"

@@ -378,7 +378,7 @@ def test_a_robot_recorded_by_its_capsules_is_judged_by_them(tmp_path: Path) -> N
     assert motion["q1"].isna().all()
     ticks_ns = motion["t_ns"].to_numpy()
     base = np.array([0.1, 0.35, 1.0])
-    within = (ticks_ns >= aticks_ns[0]) & (ticks_ns <= aticks_ns[-1])
+    within = (ticks_ns >= at_ns[0]) & (ticks_ns <= at_ns[-1])
     tip = np.column_stack([np.interp(ticks_ns, at_ns, numbers[:, 6, 3 + k]) + base[k] for k in range(3)])
     assert np.abs(motion[["tcp_x", "tcp_y", "tcp_z"]].to_numpy()[within] - tip[within]).max() < 1e-4
     run_config = resolve("report", bag, config=tmp_path / "s.toml", cell_file=tmp_path / "cell.toml", end_s=6.0)
