@@ -295,7 +295,7 @@ def _write_escapes(found: dict[str, Any], writer: RunWriter) -> None:
 
 
 def _cameras(audit: LogAudit) -> dict[str, dict[str, int | None]]:
-    """Returns, per camera, the counts of observed and disbelieved points; None if none was disbelieved."""
+    """Returns, per camera, the counts of observed and rejected points; None if none was rejected."""
     counts = audit.recording.counts
     names = {
         "frames": "frames",

@@ -99,7 +99,7 @@ def recorded_future(t_ns: Ints, points_m: Floats, states: HumanStates, horizon_s
 
     Args:
         t_ns: (m,) instants of the recorded points, increasing [ns].
-        points_m: (m, 20, 3) POINTS of the person, world [m]; NaN if not recorded or disbelieved.
+        points_m: (m, 20, 3) POINTS of the person, world [m]; NaN if not recorded or rejected.
         states: (n,) the fused person at the ticks.
         horizon_s: T, the prediction's horizon plus the latency, one per tick or one for all [s].
     """

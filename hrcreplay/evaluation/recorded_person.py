@@ -74,7 +74,7 @@ class Recording:
 
     states: HumanStates  #: the fused person at every tick, from the frames that had arrived
     t_ns: Ints  #: (m,) instants of the recorded points, increasing
-    points_m: Floats  #: (m, 20, 3) POINTS, world [m]; NaN if not recorded or disbelieved
+    points_m: Floats  #: (m, 20, 3) POINTS, world [m]; NaN if not recorded or rejected
     joints_t_ns: Ints  #: (k,) instants of the recorded joints, increasing
     joints: Floats  #: (k, 13) JOINTS [m, m, rad..., m]
     source: str  #: TRUTH, CAMERAS or SMOOTHED
@@ -115,7 +115,7 @@ class RecordedPeople:
 
     source: str  #: TRUTH, CAMERAS or SMOOTHED: source of ``points_m``
     t_ns: Ints  #: (m,) instants of the person's recorded points, increasing
-    points_m: Floats  #: (m, 20, 3) POINTS of the person, of all cameras in order of time, world [m]; NaN: disbelieved
+    points_m: Floats  #: (m, 20, 3) POINTS of the person, of all cameras in order of time, world [m]; NaN: rejected
     person: tuple[BodyTrack, ...]  #: only the truth; else the smoothed person and each camera's points
     others: tuple[BodyTrack, ...]  #: every other body of every camera
 
@@ -203,7 +203,7 @@ def read_people(
     if not seen:
         return RecordedPeople(SMOOTHED, smoothed.t_ns, smoothed.points_m, (smoothed,), tracks)
     measurements = Measurements.join(seen)
-    points, _ = _select_believed(measurements, best, fusion_stage)
+    points, _ = _select_accepted(measurements, best, fusion_stage)
     source, t_ns, points_m = _recorded_points(measurements, points, best)
     cameras = [
         _track(camera, measurements.capture_ns[mine], points[mine])
@@ -310,14 +310,14 @@ def read_recording(log: Log, ticks_ns: Ints, fusion_stage: FusionStage, progress
         passed.append(states)
         best += smoother.add(states, trace)
     smoothed, measurements = HumanStates.join([*best, *smoother.finish()]), Measurements.join(seen)
-    points, rejected = _select_believed(measurements, smoothed, fusion_stage)
+    points, rejected = _select_accepted(measurements, smoothed, fusion_stage)
     counts.update(rejected)
     source, t_ns, points_m = _recorded_points(measurements, points, smoothed)
     return Recording(HumanStates.join(passed), t_ns, points_m, smoothed.t_ns, smoothed.p, source, _plain(log, counts))
 
 
 def _recorded_points(seen: Measurements, points: Floats, best: HumanStates) -> tuple[str, Ints, Floats]:
-    """Returns source, instants and points of the person: believed camera points, else the smoothed person."""
+    """Returns source, instants and points of the person: accepted camera points, else the smoothed person."""
     if not np.isfinite(points).any():
         return SMOOTHED, best.t_ns, skeleton(best.p, best.lengths_m)
     order = np.argsort(seen.capture_ns, kind="stable")
@@ -357,8 +357,8 @@ def fuse_stretches(
         raise LogError(f"{log.header.path}: no camera saw anybody; an audit needs a person")
 
 
-def _select_believed(seen: Measurements, best: HumanStates, fusion_stage: FusionStage) -> tuple[Floats, Counter[str]]:
-    """Returns the believed measured points (m, 20, 3), and the number of other points per camera and reason.
+def _select_accepted(seen: Measurements, best: HumanStates, fusion_stage: FusionStage) -> tuple[Floats, Counter[str]]:
+    """Returns the accepted measured points (m, 20, 3), and the number of other points per camera and reason.
 
     A missing point or one with confidence 0 counts as not seen. A point counts as doubted if its confidence is too low,
     if it is attached to such a point, or if it was seen before the person was known. A point with sufficient confidence
@@ -387,12 +387,10 @@ def _select_believed(seen: Measurements, best: HumanStates, fusion_stage: Fusion
             fits = np.linalg.norm(seen.points_m[:, k] - seen.points_m[:, j], axis=1) <= longest_m
             jumped[:, k] = trusted[:, k] & (jumped[:, j] | (good[:, j] & ~fits))
             good[:, k] &= good[:, j] & fits
-    return np.where((good & measured)[..., None], seen.points_m, np.nan), _count_disbelieved(
-        seen, measured, good, jumped
-    )
+    return np.where((good & measured)[..., None], seen.points_m, np.nan), _count_rejected(seen, measured, good, jumped)
 
 
-def _count_disbelieved(seen: Measurements, measured: Bools, good: Bools, jumped: Bools) -> Counter[str]:
+def _count_rejected(seen: Measurements, measured: Bools, good: Bools, jumped: Bools) -> Counter[str]:
     """Counts, per camera, the points not seen, doubted and jumping, and the frames with a jumping point."""
     counts: Counter[str] = Counter()
     for c, camera in enumerate(seen.cameras):

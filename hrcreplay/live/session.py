@@ -98,7 +98,7 @@ def _finish(partial: Path, crashes: list[str]) -> Path:
     except KeyboardInterrupt:
         again = f"hrcreplay verify {partial} --finish"
         raise LiveStopped(
-            f"interrupted while its run folder was made; the record is whole, go on with: {again}"
+            f"interrupted while its run folder was made; the record is complete, so make the folder with: {again}"
         ) from None
     except HrcReplayError:
         if not crashes:

@@ -572,7 +572,7 @@ def _match_names(
     """Returns remarks on names other than the robot's, and on joints that are not axes."""
     if all(name.startswith(_NAMELESS) for name in names.values()):
         order = ", ".join(names)
-        yield f"robot joints: {next(iter(chosen.values())).name} has no names; its order is believed to be {order}"
+        yield f"robot joints: {next(iter(chosen.values())).name} has no names; the assumed order is {order}"
     elif list(names.values()) != list(names):
         yield f"robot joints: read as {', '.join(f'{axis} = {name}' for axis, name in names.items())}"
     others: dict[str, float] = {}

@@ -1,4 +1,4 @@
-"""Fits how far to believe the filter's deviations: ``python -m tests.tools.deviations``, with others' recordings.
+"""Fits the constants of the reported deviations: ``python -m tests.tools.deviations``, with others' recordings.
 
 Writes docs/deviations.md, and says what ``human.fusion.reported_deviations.FITTED`` would be right.
 """
@@ -118,16 +118,16 @@ def lines(samples: Sequence[Sample]) -> list[str]:
     left_out = [of.in_deviations(fit([other for other in samples if other is not of])) for of in samples]
     reported = [of.in_deviations(FITTED) for of in samples]
     text = [
-        "# How far to believe the deviations",
+        "# Accuracy of the reported deviations",
         "",
         "`state.parquet` has a standard deviation for each position and velocity. This page compares them with the",
-        "errors, against the truth of simulated logs and against recordings smoothed with what came later. It is",
+        "errors, against the truth of simulated logs and against recordings smoothed with later frames. It is",
         "written by `make deviations`, which also fits the constants of",
         "`hrcreplay/human/fusion/reported_deviations.py`; *filter alone* is the covariance of the Kalman filter, *left",
-        "out* are constants fitted to the other logs, *reported* those in the code. An error over its deviation has a",
-        "root mean square (rms) of 1 where the deviation is right, more where it is too small. Of normal errors 68, 95",
-        "and 99.7 % are within 1, 2 and 3.",
-        "Six of the simulated logs are of one kind, people who get up: to leave one of them out says little.",
+        "out* are constants fitted to the other logs, *reported* those in the code. The ratio of an error",
+        "to its deviation has a root mean square (rms) of 1 if the deviation is right, and more if it is too small. Of",
+        "normal errors 68, 95 and 99.7 % are within 1, 2 and 3 deviations.",
+        "Six of the simulated logs are alike, people who get up, so leaving out one of them is a weak test.",
         "",
     ]
     for true, title in ((True, "Against the truth"), (False, "Against smoothed recordings")):
