@@ -121,7 +121,9 @@ def import_motion(form: Format, paths: Mapping[str, Path], out: Path, mapping: I
     first_ns = min(int(track.t_ns[0]) for track in tracks.values())
     shift_ns = START_NS - first_ns if first_ns < START_NS else 0
     if shift_ns:
-        notes.append(f"the times begin at {first_ns * 1e-9:g} s: moved by {shift_ns * 1e-9:g} s, as 0 means no time")
+        notes.append(
+            f"the times begin at {first_ns * 1e-9:g} s; {shift_ns * 1e-9:g} s are added, because 0 means no time"
+        )
     bodies = {}
     for camera, track in tracks.items():
         points, confidence, told = body_points(track, form, mapping, f"{paths[camera]}")
@@ -153,7 +155,7 @@ def body_points(track: Tracks, form: Format, mapping: ImportMapping, where: str)
     notes = []
     if name == _SKIN:
         confidence = np.where(confidence > 0, _SKIN_CONFIDENCE, 0.0)
-        notes.append("markers on the skin stand for joints, a few centimetres off: confidence 0.5")
+        notes.append("markers on the skin are used as joints, with errors of a few centimetres: confidence 0.5")
     unit = mapping.unit or track.unit
     if unit is None:
         unit = _unit_by_size(found, where)

@@ -384,7 +384,7 @@ def find_poses(
             told = [*(f"camera {camera}" for camera in poses), *([f"the robot's base ({stand})"] if stand else [])]
             note = (
                 f"/tf_static gives the poses of {', '.join(told)} in {name}, whose z = 0 counts as the floor; they "
-                "count unless a cell places a camera"
+                "are used unless a cell file has the pose of a camera"
             )
             return StaticPoses(poses, T_world_base, (note,))
     return StaticPoses({}, None, ())

@@ -211,7 +211,8 @@ def figures(variant: Variant, motion: pd.DataFrame, contact: pd.DataFrame, bound
     causes = braking_events(motion, bounds.stationary_m_per_s)
     found["braking_events"] = sum(causes.values())
     jerk = _jerk(motion)
-    jerk = jerk[np.isfinite(jerk).all(axis=1)]  # accelerations are not recorded
+    # Accelerations are not recorded. The memory layout is kept, as it is the order of the sum.
+    jerk = np.asfortranarray(jerk[np.isfinite(jerk).all(axis=1)])
     found["jerk_rms_rad_per_s3"] = float(np.sqrt(np.mean(jerk**2))) if jerk.size else None
     found["jerk_max_rad_per_s3"] = float(np.abs(jerk).max()) if jerk.size else None
     for prefix, until in (("", "volumes"), ("full_", "volumes_full")):

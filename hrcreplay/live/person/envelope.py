@@ -83,10 +83,12 @@ class Opener:
             raise UnverifiedError(f"its source {name!r} is not in live.zenoh.sources")
         number, t_ns = _NUMBERS.unpack(head[-_NUMBERS.size :])
         if abs(now_ns - t_ns) > self._late_ns:
-            raise UnverifiedError(f"sealed {(now_ns - t_ns) / 1e9:.3f} s before it came; clocks, or an old frame again")
+            raise UnverifiedError(
+                f"sealed {(now_ns - t_ns) / 1e9:.3f} s before its arrival; set the clocks, or find who sends old frames"
+            )
         last_ns, last = self._last.get(name, (-1, -1))
         if t_ns < last_ns or (t_ns == last_ns and number <= last):
-            raise UnverifiedError("came twice, or after a later one")
+            raise UnverifiedError("arrived twice, or after a newer frame")
         self._last[name] = (t_ns, number)
         return frame
 

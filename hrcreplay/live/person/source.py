@@ -181,7 +181,7 @@ class ZenohSource:
         Thread(target=self._begin, name="opening zenoh", daemon=True).start()
 
     def go(self, start_ns: int) -> None:  # noqa: ARG002 - live frames have no start of their own
-        """Lets frames through from now on."""
+        """Sends frames from now on."""
         self._going = True
 
     def due(self, now_ns: int) -> Iterator[Outgoing]:  # noqa: ARG002

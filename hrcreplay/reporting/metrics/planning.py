@@ -3,7 +3,7 @@
 The reference may be ahead of the robot (by plan.max_reference_lead_m, or without bound if it does not wait), so its
 time is not the progress of the robot. Progress is measured at the foot point of the TCP on the programmed path: the
 nearest point of the next section of the path, which never moves back and never passes the reference. The programmed
-time at the foot point is the time that the robot reached.
+time at the foot point is the progress of the robot.
 """
 
 from __future__ import annotations

@@ -55,7 +55,7 @@ def test_a_source_that_starts_again_counts_from_the_beginning() -> None:
         (b"HRC1\x04left", "cut short"),
         (Sealer(b"another secret!!", "left").seal(b"frame", NOW_NS), "another secret"),
         (Sealer(SECRET, "right").seal(b"frame", NOW_NS), "'right' is not in live.zenoh.sources"),
-        (Sealer(SECRET, "left").seal(b"frame", NOW_NS - 310_000_000), r"sealed 0\.310 s before"),
+        (Sealer(SECRET, "left").seal(b"frame", NOW_NS - 310_000_000), r"sealed 0\.310 s before its arrival"),
         (Sealer(SECRET, "left").seal(b"frame", NOW_NS + 310_000_000), r"sealed -0\.310 s before"),
     ],
 )

@@ -98,9 +98,9 @@ def headline(facts: Facts) -> str:
 _ENCLOSES = {
     "sound": "everybody whose limbs keep to the bounds on departures; of a limb out of sight, or under limits without "
     "such bounds, every motion of the model from every state within `prediction.sigmas` of the estimate; over the "
-    "braking time and the latency, with a hand, a lower body, and what the body was off the model",
-    "paper": "Eq. (20)-(30), Alg. 1 and 2 as printed, corrected only where the print computes nothing",
-    "positions": "what positions and velocity bounds alone give, as printed",
+    "braking time and the latency, with a hand, a lower body, and the measured distance of the body from the model",
+    "paper": "Eq. (20)-(30), Alg. 1 and 2 as printed, corrected only where the printed equations cannot be computed",
+    "positions": "only bounds of positions and velocities, as printed",
 }
 
 
