@@ -91,7 +91,7 @@ def test_tables_with_a_row_per_frame(ending: str, more: str, tmp_path: Path) -> 
     path = write_table(tmp_path / f"a.{ending}", records)
     frames, notes = imported("table", path, tmp_path, mapping=WIDE + more)
     check(frames)
-    assert tells(notes, "times", "1", "moved")
+    assert tells(notes, "times", "1", "added")
     assert not tells(notes, "lack")
 
 
