@@ -30,6 +30,7 @@ from hrcreplay.pipeline.assembly import PredictionStage
 from hrcreplay.pipeline.run_config import RunConfig, RunOptions, resolve
 from hrcreplay.pipeline.stages import NS, ProgressBar, span_ns, tick_times
 from hrcreplay.records import JOINTS, LIMBS, Floats
+from hrcreplay.reporting.tables import share_text
 from hrcreplay.version import __version__
 
 
@@ -71,9 +72,9 @@ def lines(found: Fit, limits: LimitSet, facts: dict[str, Any], standard: str) ->
 def _text(share: dict[str, Any]) -> str:
     if "share" not in share:
         return "unknown"
-    numbers = f"{100.0 * share['share']:.1f} %"
+    numbers = share_text(share["share"])
     if "low" in share:
-        numbers += f" ({100.0 * share['low']:.1f} to {100.0 * share['high']:.1f} %)"
+        numbers += f" ({share_text(share['low'])} to {share_text(share['high'])})"
     return f"{numbers} of {share['ticks']} ticks"
 
 
@@ -309,7 +310,7 @@ def _missed(facts: dict[str, Any], coverage: float) -> str:
     wanted = [(facts["pooled_are"], facts["unknown"], coverage)]
     wanted += [(log["name"], log["shares"], 1.0 - EACH * (1.0 - coverage)) for log in facts["logs"]]
     return "; ".join(
-        f"{name}: found {100.0 * share['share']:.1f} % at {h:g} s, would be right: at least {100.0 * least:.1f} %"
+        f"{name}: found {share_text(share['share'])} at {h:g} s; would be right: at least {share_text(least)}"
         for name, shares, least in wanted
         for h, share in zip(facts["horizon_s"], shares, strict=True)
         if share.get("share", 1.0) < least

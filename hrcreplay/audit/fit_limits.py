@@ -224,7 +224,7 @@ class _Side:
 def _give_up(sides: list[_Side], budget: int) -> None:
     """Tightens sides while at most ``budget`` ticks are missed in total.
 
-    Steps of several sizes are tried, as missing a single tick of a fast motion gains nothing.
+    Tries steps of several sizes, because a fast motion lasts several ticks: to miss only one of them lowers no bound.
     """
     missed = np.sum([side.now.missed for side in sides], axis=0)
     smallest = max(1, budget // _STEPS)

@@ -24,7 +24,7 @@ from hrcreplay.records import JOINTS, LIMBS
 from hrcreplay.reporting.metrics.series import ANGLES, Metric
 from hrcreplay.reporting.page.report_page import PageFigure, PageSection
 from hrcreplay.reporting.summary_text import Answer, Card
-from hrcreplay.reporting.tables import PageTable, text_of
+from hrcreplay.reporting.tables import PageTable, percent, share_text, text_of
 
 CAPTIONS = {
     "audit_coverage": (
@@ -97,17 +97,15 @@ def _answer(found: Mapping[str, Any]) -> Answer:
         f"Method {METHODS.get(method, method)}, limits {', '.join(limits)}: at this share of {share['samples']} ticks "
         f"every limb that was checked ({checked_scope(found['total'], method)}) stayed, limb radius included, around "
         f"its recorded points ({', '.join(sources)}) in its own volume for all of the next {found['horizon_s']:g} s. "
-        f"95 % interval {100 * share['low']:.1f} to {100 * share['high']:.1f} %. For skeleton points only, "
-        f"limb thickness ignored, it is {100 * whole['points_share']['value']:.1f} %."
+        f"95 % interval {share_text(share['low'])} to {share_text(share['high'])}. For skeleton points only, "
+        f"limb thickness ignored, it is {percent(whole['points_share'])}."
     )
     deepest = whole["escape_max_m"]
     if deepest is not None:
         words += f" The deepest escape was {100 * deepest:.1f} cm."
     for note in unchecked_notes(found["total"], method):
         words += f" {note[0].upper()}{note[1:]}."
-    return Answer(
-        "Did the person stay in the predicted volumes?", f"At {100 * share['value']:.2f} % of the ticks.", words
-    )
+    return Answer("Did the person stay in the predicted volumes?", f"At {percent(share, 2)} of the ticks.", words)
 
 
 def _cards(found: Mapping[str, Any]) -> tuple[Card, ...]:
@@ -116,7 +114,7 @@ def _cards(found: Mapping[str, Any]) -> tuple[Card, ...]:
         whole = found["total"]["methods"][method]["all"]
         if whole["covered_share"]["value"] is not None:
             room = text_with_interval(whole["union_m3"], decimals=2)
-            value = f"{100 * whole['covered_share']['value']:.1f} %"
+            value = percent(whole["covered_share"])
             cards.append(Card(value, METHODS.get(method, method), f"union {room} m\u00b3"))
     return tuple(cards)
 
@@ -330,8 +328,8 @@ def _first_movements(log: Mapping[str, Any], method: str) -> PageTable:
         for one in log["first_movements"]
     )
     note = (
-        "When an end of the limb was first 10 cm from where it had been: a movement that the filter could not foresee. "
-        "Counted are the ticks up to a horizon before and after."
+        "When an end of the limb was first 10 cm from where it had been: a movement that the filter could not predict. "
+        "The ticks up to a horizon before and after it are counted."
     )
     title = f"{log['log']}: first movements, and {METHODS.get(method, method)} then"
     return PageTable(title, ("first", "limb", "ticks checked", "of these outside", "deepest [mm]"), rows, note)
