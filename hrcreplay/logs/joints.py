@@ -215,6 +215,7 @@ def match_names(topics: Sequence[JointTopic], axes: Sequence[str], given: Sequen
     """Matches axes to joints in the log by name: axis -> joint.
 
     A joint is the axis of the same name, ignoring case and characters other than letters and digits: joint1 is joint_1.
+    Where the robot's axes have the names of a maker, other names that the maker's drivers give to the same axes count.
     The order in a message is used only if it has no names and as many positions as the robot has axes. A log that
     numbers its joints from 0, or beyond the axes of the robot, counts as that of another robot until names are given.
 
@@ -245,7 +246,46 @@ def match_names(topics: Sequence[JointTopic], axes: Sequence[str], given: Sequen
     nameless = [name for name in found if name.startswith(_NAMELESS)]
     if not names and len(nameless) == len(axes):
         return dict(zip(axes, nameless, strict=True))
+    if made := _match_by_make(list(found), axes):
+        return made
     raise _unfit(topics, axes, more, where)
+
+
+#: Names that drivers and recorders of a maker give to its axes, each with what numbers the axis; a prefix may precede.
+_UR = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+_MAKES = (
+    (re.compile(r"(?:.*[_/.])?(?:panda|fr3|fer)_joint_?([1-7])"), "1234567"),
+    (re.compile(rf"(?:.*[_/.])?({'|'.join(_UR)})(?:_joint)?"), _UR),
+    (re.compile(r"(?:.*[_/.])?actual_q_?([0-5])"), "012345"),
+    (re.compile(r"(?:.*[_/.])?a([1-7])"), "1234567"),
+)
+#: Makes of ``_MAKES`` that name the axes of the robot -> makes that may name them in a log.
+_SAME_MAKE = {0: (0,), 1: (1, 2), 3: (3,)}
+
+
+def _match_by_make(found: Sequence[str], axes: Sequence[str]) -> dict[str, str]:
+    """Matches the axes of a Franka, Universal Robots or KUKA arm to joints named by its maker; empty if not certain.
+
+    Every axis must have a name of one maker, and every such name must be in the log exactly once: a log of two arms, or
+    of one with other axes, is not matched.
+    """
+    for make, others in _SAME_MAKE.items():
+        mine = _places(axes, make)
+        if sorted(mine.values()) != list(range(len(axes))):
+            continue
+        for other in others:
+            theirs = _places(found, other)
+            if sorted(theirs.values()) == list(range(len(axes))):
+                joints = {place: name for name, place in theirs.items()}
+                return {axis: joints[place] for axis, place in mine.items()}
+    return {}
+
+
+def _places(names: Sequence[str], make: int) -> dict[str, int]:
+    """Returns name -> number of the axis, from 0 at the base, of the names of a make."""
+    pattern, order = _MAKES[make]
+    matches = {name: pattern.fullmatch(name.casefold()) for name in names}
+    return {name: order.index(match[1]) for name, match in matches.items() if match}
 
 
 def _check_names(found: Sequence[str], axes: Sequence[str], given: Sequence[str]) -> dict[str, str]:

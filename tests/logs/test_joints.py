@@ -146,6 +146,49 @@ def test_a_log_that_counts_its_joints_otherwise_is_of_another_robot(tmp_path: Pa
     np.testing.assert_array_equal(track.q[0], [0.2, 0.0, 0.1])
 
 
+UR = ("shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", "wrist_1_joint", "wrist_2_joint", "wrist_3_joint")
+
+
+@pytest.mark.parametrize(
+    ("axes", "names"),
+    [
+        (tuple(f"panda_joint{i}" for i in range(1, 8)), tuple(f"left_fr3_joint{i}" for i in range(1, 8))),
+        (tuple(f"arm_{name}" for name in UR), UR),
+        (UR, tuple(f"actual_q_{i}" for i in range(6))),
+        (tuple(f"joint_a{i}" for i in range(1, 7)), tuple(f"A{i}" for i in range(1, 7))),
+    ],
+)
+def test_the_names_of_a_maker_are_understood_in_any_order(
+    tmp_path: Path, axes: tuple[str, ...], names: tuple[str, ...]
+) -> None:
+    n = len(names)
+    order = [*range(1, n, 2), *range(0, n, 2)]
+    extra = {"gripper": 0.0}
+    sent: list[Sent] = [
+        (a, s, {names[k]: 0.1 * k + 1e-3 * i for k in order} | extra, topic)
+        for i, (a, s, _, topic) in enumerate(regular(30))
+    ]
+    log, track = read(write(tmp_path / "a", sent), axes)
+    np.testing.assert_allclose(track.q[5], 0.1 * np.arange(n) + 5e-3, atol=1e-12)
+    assert any(f"{axes[1]} = {names[1]}" in note for note in log.joint_notes)
+
+
+@pytest.mark.parametrize(
+    ("axes", "names"),
+    [
+        (UR, tuple(f"{side}_{name}" for side in ("left", "right") for name in UR)),  # two arms
+        (tuple(f"panda_joint{i}" for i in range(1, 8)), tuple(f"fr3_joint{i}" for i in range(1, 7))),  # one is missing
+        (tuple(f"joint_{i}" for i in range(1, 7)), tuple(f"actual_q_{i}" for i in range(6))),  # not a UR
+        (tuple(f"joint_a{i}" for i in range(1, 7)), tuple(f"A{i}" for i in range(1, 8))),  # one axis more
+    ],
+)
+def test_names_of_a_maker_that_do_not_fit_the_robot_are_refused(
+    tmp_path: Path, axes: tuple[str, ...], names: tuple[str, ...]
+) -> None:
+    sent: list[Sent] = [(a, s, dict.fromkeys(names, 0.1), topic) for a, s, _, topic in regular(30)]
+    assert isinstance(refusal(write(tmp_path / "a", sent), axes), LogError)
+
+
 def test_positions_without_names_are_believed_in_their_order_and_told(tmp_path: Path) -> None:
     path = write(tmp_path / "a", regular(60), names=False)
     log, track = read(path)
