@@ -320,7 +320,7 @@ def _track(
     q, dq = (_pick(motion, [f"{kind}{i}" for i in axes], t_ns) for kind in ("q", "dq"))
     numbers = _pick(motion, ["tcp_speed", "ref_speed", "distance_m", "horizon_s", "tau_s", "certified"], t_ns)
     body = np.full(len(t_ns), np.nan) if contact is None else _pick(contact, ["distance_m"], t_ns)[:, 0]
-    certified = np.where(np.isfinite(numbers[:, 5]), numbers[:, 5], -1).astype(np.int64)
+    certified = np.where(np.isfinite(numbers[:, 5]) & (method != RECORDED), numbers[:, 5], -1).astype(np.int64)
     return MethodTrack(
         q=q,
         stop_q=_stops(run, method, motion, robot, t_ns, q, dq, numbers[:, 4]),
@@ -332,7 +332,8 @@ def _track(
         body_m=body,
         horizon_s=numbers[:, 3],
         certified=certified,
-        names={name: _names(motion, name, t_ns) for name in ("status", "reason", "limb", "link")},
+        names={name: _names(motion, name, t_ns) for name in ("status", "reason", "limb", "link")}
+        | ({"status": (("as recorded",), np.zeros(len(t_ns), np.int64))} if method == RECORDED else {}),
         events=stop_events(motion, contact, t0_ns, slow),
     )
 

@@ -114,9 +114,9 @@ def _at_known_ticks(metrics: Metrics) -> str:
     return f"{which}{where}, judged by the {metrics['contact_person']['value']}"
 
 
-def _at_rest(metrics: Metrics) -> str:
+def _at_rest(metrics: Metrics, prefix: str = "plan") -> str:
     """Describes contacts of a robot at rest."""
-    rest, deep = metrics["plan_touch_rest_ticks"]["value"], metrics["plan_body_distance_min_rest_m"]["value"]
+    rest, deep = (metrics[f"{prefix}_{name}"]["value"] for name in ("touch_rest_ticks", "body_distance_min_rest_m"))
     if not rest:
         return ""
     return f" The robot at rest was in contact at {_count(rest)}, up to {-100 * deep:.0f} cm deep."
@@ -350,18 +350,18 @@ def in_short_as_it_ran(metrics: Metrics) -> str:
         return "It is not known whether the robot touched anybody as it ran."
     if touch["value"]:
         seconds, speed = (text_of(metrics[f"recorded_touch_{w}"]) for w in ("moving_s", "contact_speed_max_m_per_s"))
-        return f"As it ran, the moving robot touched {_whom(metrics, RECORDED)}: {seconds}, up to {speed}."
-    if near is None:
-        return "As it ran, the robot did not move while anybody was known to be there."
-    kept = f"it kept {_centimetres(near)} away or more"
-    return f"As it ran{_as_far_as(metrics)} the moving robot touched nobody: {kept}."
+        words = f"As it ran, the moving robot touched {_whom(metrics, RECORDED)}: {seconds}, up to {speed}"
+    elif near is None:
+        words = "As it ran, the robot did not move while anybody was known to be there"
+    else:
+        kept = f"it kept {_centimetres(near)} away or more"
+        words = f"As it ran{_as_far_as(metrics)} the moving robot touched nobody: {kept}"
+    return f"{words}.{_at_rest(metrics, RECORDED)}"
 
 
 def detailed_as_it_ran(metrics: Metrics) -> str:
-    """States what ``in_short_as_it_ran`` covers, contacts at rest, and if the robot could have stopped in time."""
+    """States what ``in_short_as_it_ran`` covers, and if the robot could have stopped in time."""
     words = [_covered_as_it_ran(metrics)]
-    if rest := metrics["recorded_touch_rest_ticks"]["value"]:
-        words.append(f"At rest it was in contact at {_count(rest)}.")
     late, known = (metrics[f"recorded_{name}_moving_ticks"] for name in ("contact", "separation"))
     if late["value"] is not None:
         words.append(

@@ -17,14 +17,14 @@ from numpy.testing import assert_allclose, assert_array_equal
 from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
-from hrcreplay.commands import compare, replay
+from hrcreplay.commands import compare, replay, report
 from hrcreplay.errors import LogError
 from hrcreplay.evaluation.recorded_person import RecordedPeople, read_people
 from hrcreplay.human.model import part_radii
 from hrcreplay.logs.reader import open_log
 from hrcreplay.logs.writer import LogWriter
 from hrcreplay.pipeline import assembly
-from hrcreplay.pipeline.run_config import RunConfig, resolve
+from hrcreplay.pipeline.run_config import RunConfig, read_run_config, resolve
 from hrcreplay.records import Floats, HumanStates, Ints
 from hrcreplay.reporting import verdict
 from hrcreplay.robot import irb140
@@ -236,6 +236,28 @@ def test_the_recorded_robot_is_told_first_and_its_unknown_ticks_with_it(ran: Ran
     assert found.table.rows[1][0] == "scaling (this plan)"
     assert "gap in the robot states: 139" in found.sentences[0]
     assert "Was it safe as it ran?" in (ran.folder / "report.html").read_text()
+
+
+def test_the_replay_shows_the_recorded_robot_without_a_certificate(ran: Ran) -> None:
+    scene = report.scene_of(read_run_config(ran.folder), run_folder.read(ran.folder))
+    assert scene is not None
+    assert list(scene.methods) == ["scaling", "recorded"]
+    track = scene.methods["recorded"]
+    assert set(track.certified.tolist()) == {-1}
+    assert track.names["status"][0] == ("as recorded",)
+    assert_array_equal(np.isnan(track.q).any(axis=1), np.isnan(track.tcp_m).any(axis=1))
+    assert 0 < np.isnan(track.q).any(axis=1).sum() < len(track.q)
+
+
+def test_contact_of_the_robot_at_rest_is_told_with_the_answer(ran: Ran) -> None:
+    metrics = json.loads((ran.folder / "metrics.json").read_text())
+    metrics["recorded_touch_moving_ticks"]["value"] = 0
+    metrics["recorded_touch_rest_ticks"]["value"] = 430
+    metrics["recorded_body_distance_min_moving_m"]["value"] = 0.246
+    metrics["recorded_body_distance_min_rest_m"]["value"] = -0.124
+    found = verdict.in_short_as_it_ran(metrics)
+    assert "24 cm away" in found
+    assert found.endswith("The robot at rest was in contact at 430 ticks, up to 12 cm deep.")
 
 
 def test_compare_puts_the_recorded_robot_first_with_the_contacts_of_the_report(ran: Ran, tmp_path: Path) -> None:

@@ -34,6 +34,8 @@ export async function start(root) {
     return index >= 0 ? header.methods[state.method].names[kind][index] : "";
   };
   const number = (name) => nearest(data.motion(`${state.method}/${name}`), Math.floor(row() + 1e-6));
+  const metresPerSecond = (x, programmed) =>
+    Number.isFinite(x) ? `${x.toFixed(2)}${Number.isFinite(programmed) ? ` of ${programmed.toFixed(2)}` : ""} m/s` : "not known";
   const centimetres = (x) => (Number.isFinite(x) ? `${Math.round(100 * x)} cm` : "not known");
 
   function draw() {
@@ -57,7 +59,7 @@ export async function start(root) {
     const status = text("status"), reason = text("reason");
     const lines = [
       ["status", status + (reason && status !== "tracking" ? ` (${reason})` : "")],
-      ["speed", `${number("tcp_speed").toFixed(2)} of ${number("ref_speed").toFixed(2)} m/s`],
+      ["speed", metresPerSecond(number("tcp_speed"), number("ref_speed"))],
       ["to the body", near.body ? `${centimetres(number("body_m"))}: ${near.body.link} – ${near.body.limb}` : "not known"],
       ["to the volumes", centimetres(number("distance_m"))],
       ["predicted for", Number.isFinite(number("horizon_s")) ? `${Math.round(1000 * number("horizon_s"))} ms` : "–"],
