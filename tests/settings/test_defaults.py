@@ -14,7 +14,7 @@ from hrcreplay.settings.sections import Settings, setting
 
 PACKAGE = Path(__file__).parents[2] / "hrcreplay"
 #: What a task file says, not a settings file, though a word is the same.
-OTHERS = {("robot/task.py", "acceleration")}
+OTHERS = {("robot/task.py", "acceleration"), ("logs/table_files.py", "unit")}
 
 
 def defaults(section: BaseModel) -> dict[str, list[Any]]:
