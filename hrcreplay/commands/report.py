@@ -72,7 +72,8 @@ def scene_of(run_config: RunConfig, run: Run) -> ReplayScene | None:
         return None
     radii_m = part_radii(run_config.settings.prediction, run_config.settings.report.leg_radius_m)
     parts = dict(zip(PARTS, radii_m.tolist(), strict=True))
-    return replay_scene(run, assembly.robot(run_config, run.T_world_base), start_ns(run), parts)
+    robot = assembly.robot(run_config, run.T_world_base)
+    return replay_scene(run, robot, start_ns(run), parts, assembly.bounded_hulls(run_config, robot))
 
 
 def _stops(

@@ -470,6 +470,12 @@ def static_hulls(objects: Sequence[CellObject], model: RobotModel) -> list[Stati
     return found
 
 
+def bounded_hulls(run_config: RunConfig, model: RobotModel) -> list[StaticHull]:
+    """Returns the parts of the objects of a run's cell for drawing: all but half-spaces, in the world."""
+    objects = () if run_config.cell is None else run_config.cell.objects
+    return static_hulls([one for one in objects if one.normal is None], model)
+
+
 def static_scene(run_config: RunConfig, model: RobotModel, path: Reference, s_s: float) -> StaticObstacles | None:
     """Makes what a run's robot keeps clear of beside people; None if its cell has no objects and there is no SRDF.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +16,7 @@ from hrcreplay.reporting.metrics.contact import StopEvent, method_prefixes, moti
 from hrcreplay.reporting.metrics.planning import numeric_column
 from hrcreplay.reporting.metrics.series import seconds_from, times
 from hrcreplay.robot.control.control_step import stop_axis_by_axis
+from hrcreplay.robot.control.static_obstacles import StaticHull
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.settings.sections import setting
 from hrcreplay.store.run_folder import Run
@@ -112,6 +113,7 @@ class ReplayScene:
     robot: RobotGeometry
     methods: dict[str, MethodTrack]  #: the run's own first
     watched_m: Floats  #: (k, 2) corners of the watched area, on the floor; k is 0 if the cell gives none
+    objects: tuple[StaticHull, ...] = ()  #: convex parts of the objects of the cell, without half-spaces
 
     @property
     def seconds(self) -> Floats:
@@ -204,7 +206,9 @@ def pose_links(robot: RobotGeometry, q: Floats) -> Floats:
     return ends
 
 
-def replay_scene(run: Run, robot: RobotModel, t0_ns: int, radii_m: Mapping[str, float]) -> ReplayScene | None:
+def replay_scene(
+    run: Run, robot: RobotModel, t0_ns: int, radii_m: Mapping[str, float], objects: Sequence[StaticHull] = ()
+) -> ReplayScene | None:
     """Makes the replay of a run with a robot; None for other runs.
 
     Args:
@@ -212,6 +216,7 @@ def replay_scene(run: Run, robot: RobotModel, t0_ns: int, radii_m: Mapping[str, 
         robot: The robot of the run at its base pose.
         t0_ns: Instant of time zero of the report [ns].
         radii_m: Part of the recorded body -> radius of its capsule [m].
+        objects: Convex parts of the objects of the cell, without half-spaces.
     """
     if run.motion is None or len(run.motion) < 2 or "q1" not in run.motion:
         return None
@@ -235,6 +240,7 @@ def replay_scene(run: Run, robot: RobotModel, t0_ns: int, radii_m: Mapping[str, 
         robot=robot_geometry(robot),
         methods={name: _track(run, name, table, robot, t_ns, t0_ns, slow) for name, table in tables.items()},
         watched_m=np.array(((run.meta.get("cell") or {}).get("watched") or {}).get("corners_m", [])).reshape(-1, 2),
+        objects=tuple(objects),
     )
 
 

@@ -31,6 +31,7 @@ _VOLUME_HZ = 5.0
 _CHUNK_BYTES = 1024 * 1024
 _STOP: Rgba = (0.80, 0.20, 0.15, 0.35)
 _WATCHED: Rgba = (0.95, 0.55, 0.10, 1.0)
+_OBJECT: Rgba = (0.60, 0.55, 0.48, 0.75)
 _OTHER: Rgba = (0.45, 0.50, 0.55, 0.35)
 _BODY: Rgba = (0.40, 0.63, 0.82, 1.0)
 _CAMERA: Rgba = (0.35, 0.60, 0.30, 0.8)
@@ -58,7 +59,8 @@ def write_scene(path: Path, scene: ReplayScene, measurements: pd.DataFrame | Non
         scene: The scene.
         measurements: Rows of measurements.parquet: the skeletons of the cameras; None without them.
     """
-    streams = [_robots(scene), _watched(scene), _transforms(scene), _person(scene), _volumes(scene), _distances(scene)]
+    streams = [_robots(scene), _watched(scene), _objects(scene), _transforms(scene), _person(scene), _volumes(scene)]
+    streams += [_distances(scene)]
     streams += [_series(scene, name, track) for name, track in scene.methods.items()]
     streams += _cameras(measurements)
     found = heapq.merge(*streams, key=lambda message: message[1])  # one instant: in the order of the streams
@@ -123,6 +125,21 @@ def _watched(scene: ReplayScene) -> Iterator[Message]:
         sides = np.stack((corners, np.roll(corners, -1, axis=0)), axis=1)
         shown = entity(t_ns, "watched area", lines=[lines(sides, 0.02, _WATCHED)])
         yield "/watched", t_ns, messages.SceneUpdate(entities=[shown])
+
+
+def _objects(scene: ReplayScene) -> Iterator[Message]:
+    """Yields the objects of the cell, without half-spaces."""
+    if not scene.objects:
+        return
+    t_ns = int(scene.t_ns[0])
+    entities = []
+    for i, one in enumerate(scene.objects):
+        corners, triangles = parts.whole_surface(one.vertices_m, one.radius_m)
+        shape = messages.TriangleListPrimitive(
+            points=parts.points(np.round(corners, 4)), indices=triangles.ravel().tolist(), color=parts.colour(_OBJECT)
+        )
+        entities.append(entity(t_ns, f"object {i} {one.name}", triangles=[shape]))
+    yield "/objects", t_ns, messages.SceneUpdate(entities=entities)
 
 
 def _transforms(scene: ReplayScene) -> Iterator[Message]:

@@ -9,7 +9,7 @@ import numpy as np
 from foxglove import messages
 from scipy.spatial import ConvexHull
 
-from hrcreplay.geometry.convex_hull import above
+from hrcreplay.geometry.convex_hull import above, hull
 from hrcreplay.records import FLOOR_Z_M, POINTS, Floats, Ints
 from hrcreplay.reporting.figures.drawing import BONES
 
@@ -102,6 +102,13 @@ def surface(vertices_m: Floats, radius_m: float, rgba: Rgba = VOLUME) -> Any:
     return messages.TriangleListPrimitive(
         points=points(np.round(corners, 3)), indices=triangles.ravel().tolist(), color=colour(rgba)
     )
+
+
+def whole_surface(vertices_m: Floats, radius_m: float) -> tuple[Floats, Ints]:
+    """Returns corners (k, 3) [m] and triangles (f, 3), outward, of an object: hull + ball, (m, 3) vertices [m]."""
+    if radius_m > 0.0:
+        vertices_m = (vertices_m[:, None, :] + radius_m * _around_a_ball()[0]).reshape(-1, 3)
+    return hull(vertices_m)
 
 
 def surface_mesh(vertices_m: Floats, radius_m: float) -> tuple[Floats, Ints]:

@@ -16,6 +16,7 @@ from hrcreplay.reporting.metrics.contact import stop_events
 from hrcreplay.reporting.page.replay_page import MISSING, NumberBlock, replay_data
 from hrcreplay.reporting.replay_scene import SHOWN_POINTS, ReplayScene
 from hrcreplay.robot.control.control_step import stop_axis_by_axis, stop_straight
+from hrcreplay.robot.control.static_obstacles import StaticHull
 from tests.reporting.moving import joints, moving_run, moving_scene, robot
 from tests.reporting.synthetic import LENGTHS_M, T0_NS, pose
 
@@ -170,3 +171,14 @@ def test_a_small_budget_costs_the_volumes_their_rate_and_nothing_else(scene: Rep
 def test_the_same_run_gives_the_same_block() -> None:
     first, second = (replay_data(moving_scene(moving_run(3.0))) for _ in range(2))
     assert first == second
+
+
+def test_the_page_has_the_surfaces_of_objects(scene: ReplayScene) -> None:
+    corners = np.array([[x, y, z] for x in (0.4, 1.0) for y in (-0.5, 0.5) for z in (0.70, 0.74)])
+    one = dataclasses.replace(scene, objects=(StaticHull("table", corners, 0.0),))
+    (shown,) = json.loads(replay_data(one)[0])["objects"]
+    assert shown["name"] == "table"
+    assert sorted(np.reshape(shown["corners"], (-1, 3)).tolist()) == sorted(corners.tolist())
+    assert sorted(set(shown["triangles"])) == list(range(8))
+    assert len(shown["triangles"]) == 36
+    assert "objects" not in json.loads(replay_data(scene)[0])

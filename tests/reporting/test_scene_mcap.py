@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections import defaultdict
 from pathlib import Path
@@ -18,6 +19,7 @@ import hrcreplay
 from hrcreplay.reporting.replay_scene import ReplayScene, pose_links
 from hrcreplay.reporting.scene_mcap import write_scene
 from hrcreplay.reporting.scene_messages import surface, surface_mesh
+from hrcreplay.robot.control.static_obstacles import StaticHull
 from tests.reporting.moving import moving_run, moving_scene, robot
 
 LAYOUT = Path(hrcreplay.__file__).parents[1] / "docs" / "foxglove-layout.json"
@@ -38,6 +40,10 @@ def file(scene: ReplayScene, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def topics(file: Path) -> dict[str, list[tuple[int, Any]]]:
     """Topic -> instants and messages."""
+    return _topics(file)
+
+
+def _topics(file: Path) -> dict[str, list[tuple[int, Any]]]:
     found = defaultdict(list)
     kinds: dict[int, Any] = {}
     with file.open("rb") as stream:
@@ -182,3 +188,26 @@ def test_the_layout_shows_topics_that_there_are(topics: dict[str, list[tuple[int
     row = topics["/plan/series"][0][1]
     assert {path.partition(".")[0] for path in paths} == {"/plan/series"}
     assert {path.partition(".")[2] for path in paths} <= row.keys()
+
+
+def test_objects_are_closed_surfaces_around_their_hulls(scene: ReplayScene, tmp_path: Path) -> None:
+    corners = np.array([[x, y, z] for x in (0.4, 1.0) for y in (-0.5, 0.5) for z in (0.70, 0.74)])
+    pipe = np.array([[0.0, 1.0, 0.2], [0.0, 1.0, 1.2]])
+    objects = (StaticHull("table", corners, 0.0), StaticHull("pipe", pipe, 0.1))
+    write_scene(tmp_path / "scene.mcap", dataclasses.replace(scene, objects=objects), None)
+    found = _topics(tmp_path / "scene.mcap")
+    ((t_ns, update),) = found["/objects"]
+    assert t_ns == scene.t_ns[0]
+    assert [entity.id for entity in update.entities] == ["object 0 table", "object 1 pipe"]
+    for entity, least, most in zip(update.entities, (0.024, 0.0328), (0.0241, 0.0357), strict=True):
+        (shape,) = entity.triangles
+        points = np.array([[p.x, p.y, p.z] for p in shape.points])
+        a, b, c = points[np.array(shape.indices).reshape(-1, 3).T]
+        volume = float((np.cross(a, b) * c).sum()) / 6.0
+        assert least <= volume + 1e-9 <= most
+    assert "/objects" not in _topics_of_scene(scene, tmp_path / "other.mcap")
+
+
+def _topics_of_scene(scene: ReplayScene, path: Path) -> dict[str, list[tuple[int, Any]]]:
+    write_scene(path, scene, None)
+    return _topics(path)

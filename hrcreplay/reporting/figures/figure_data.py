@@ -180,6 +180,7 @@ def story(run_config: RunConfig, run: Run, _people: HumanStates) -> Storyboard |
         base_m=run.T_world_base[:3, 3],
         reference_m=position_columns(alone[shown], "ref"),
         method=run_config.settings.plan.method,
+        objects=assembly.bounded_hulls(run_config, robot),
     )
 
 
@@ -202,6 +203,7 @@ def nearest_pose(run_config: RunConfig, run: Run, people: HumanStates) -> LinkPo
         ends_m=robot.ends_m(q),
         radius_m=np.array([segment.radius_m for segment in robot.segments]),
         volumes={limb: volume for limb, volume in hulls.items() if volume.known},
+        objects=assembly.bounded_hulls(run_config, robot),
     )
 
 

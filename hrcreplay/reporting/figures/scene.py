@@ -22,6 +22,7 @@ from hrcreplay.records import FLOOR_Z_M, POINTS, Floats, Ints, SweptVolume
 from hrcreplay.reporting.figures import drawing
 from hrcreplay.reporting.figures.drawing import figure_in
 from hrcreplay.reporting.metrics.series import thin_path
+from hrcreplay.robot.control.static_obstacles import StaticHull
 
 
 @dataclass(frozen=True)
@@ -189,6 +190,14 @@ def draw_outlines(ax: Axes, limbs: Mapping[str, SweptVolume], view: View) -> Non
         ax.add_collection(polygons, autolim=False)
 
 
+def draw_objects(ax: Axes, objects: Sequence[StaticHull], view: View) -> None:
+    """Objects of the cell in pale grey behind all else."""
+    edges = [RenderedHull(one.vertices_m, one.radius_m, (0.0, 0.0, 0.0)).outline(view) for one in objects]
+    polygons = PolyCollection([edge for edge in edges if len(edge)], facecolors=drawing.FAINT, zorder=-1)
+    polygons.set(edgecolors=drawing.INK, alpha=0.25, linewidths=0.5)
+    ax.add_collection(polygons, autolim=False)
+
+
 def bounds_of(edges: Sequence[Floats], margin_m: float) -> tuple[Floats, Floats]:
     """Returns the corners (2,) of the box around points (k, 2), with a margin [m]; unknown points are left out."""
     corners = np.vstack([np.zeros((0, 2)), *edges])
@@ -226,6 +235,7 @@ class LinkPose:
     ends_m: Floats  #: (s, 2, 3) world [m]
     radius_m: Floats  #: (s,) [m]
     volumes: Mapping[str, SweptVolume]  #: by limb
+    objects: Sequence[StaticHull] = ()  #: parts of the objects of the cell, without half-spaces
 
 
 @dataclass(frozen=True)
@@ -249,6 +259,7 @@ class Storyboard:
     base_m: Floats  #: (3,)
     reference_m: Floats  #: (n, 3) programmed path of the TCP in that part
     method: str
+    objects: Sequence[StaticHull] = ()  #: parts of the objects of the cell, without half-spaces
 
 
 def storyboard(story: Storyboard, t0_ns: int) -> Figure:
@@ -303,6 +314,7 @@ def _robot(ends_m: Floats, story: Storyboard) -> list[RenderedHull]:
 
 
 def _draw_scene(ax: Axes, scene: StoryScene, side: int, story: Storyboard, view: View) -> None:
+    draw_objects(ax, story.objects, view)
     if side:
         draw_outlines(ax, scene.volumes, view)
         for pair in bones(scene.points_m, view):
@@ -346,6 +358,7 @@ def links(pose: LinkPose, t0_ns: int, T_world_base: Floats) -> Figure:
         edges = [solid.outline(view) for solid in solids]
         low, high = bounds_of([*edges, view.flat(base_m[None])], _MARGIN_M)
         drawing.set_window(ax, low.tolist(), high.tolist())
+        draw_objects(ax, pose.objects, view)
         draw_outlines(ax, pose.volumes, view)
         draw_solids(ax, solids, view)
         ax.plot(*view.flat(base_m[None]).T, "s", color=drawing.INK, ms=4, zorder=4)

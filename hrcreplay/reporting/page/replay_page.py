@@ -41,7 +41,9 @@ from hrcreplay.reporting.replay_scene import (
     at_rate,
     pose_links,
 )
+from hrcreplay.reporting.scene_messages import whole_surface
 from hrcreplay.reporting.tables import part_name_text, reason_text
+from hrcreplay.robot.control.static_obstacles import StaticHull
 
 #: Modules that the browser imports by name, and their files.
 MODULES = {
@@ -226,6 +228,17 @@ def _header(scene: ReplayScene) -> dict[str, Any]:
         },
         "order": list(scene.methods),
         "watched": scene.watched_m.tolist(),
+        **({"objects": [_object(one) for one in scene.objects]} if scene.objects else {}),
+    }
+
+
+def _object(one: StaticHull) -> dict[str, Any]:
+    """Returns the surface of a part of an object."""
+    corners, triangles = whole_surface(one.vertices_m, one.radius_m)
+    return {
+        "name": one.name,
+        "corners": np.round(corners, 4).ravel().tolist(),
+        "triangles": triangles.ravel().tolist(),
     }
 
 
@@ -330,6 +343,9 @@ def draw_instant(axes: Axes, scene: ReplayScene, row: int, view: View, *, since:
         since: Instant that the driven path begins with; None: some seconds before.
     """
     track = next(iter(scene.methods.values()))
+    for one in scene.objects:
+        edge = RenderedHull(one.vertices_m, one.radius_m, to_rgb(drawing.FAINT)).outline(view)
+        axes.add_patch(Polygon(edge, facecolor=drawing.FAINT, edgecolor=drawing.INK, alpha=0.25, lw=0.5, zorder=0))
     for edge in (solid.outline(view) for solid in reach(scene, row)):
         axes.add_patch(Polygon(edge, facecolor=drawing.ORANGE, edgecolor=drawing.ORANGE, alpha=0.16, lw=0.7, zorder=1))
     shown = solids(scene, row)

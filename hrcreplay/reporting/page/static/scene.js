@@ -152,7 +152,7 @@ export class ReplayView {
     this.scene.add(sun);
     const solid = () => new THREE.MeshLambertMaterial();
     const glass = (opacity) => new THREE.MeshLambertMaterial({ transparent: true, opacity, depthWrite: false, polygonOffset: true, polygonOffsetFactor: 2, polygonOffsetUnits: 2 });
-    this.materials = { robot: solid(), shell: glass(0.18), mesh: new THREE.MeshLambertMaterial({ flatShading: true, side: THREE.DoubleSide }), stop: glass(0.35), person: solid(), volume: glass(0.2), base: solid() };
+    this.materials = { robot: solid(), shell: glass(0.18), mesh: new THREE.MeshLambertMaterial({ flatShading: true, side: THREE.DoubleSide }), stop: glass(0.35), person: solid(), volume: glass(0.2), base: solid(), object: new THREE.MeshLambertMaterial({ flatShading: true, transparent: true, opacity: 0.55 }) };
     this.renderer.localClippingEnabled = true;
     this.materials.volume.clippingPlanes = [new THREE.Plane(UP, 0)]; // above the floor
     this.robot = new Capsules(header.robot.radius_m, this.materials.robot);
@@ -169,6 +169,15 @@ export class ReplayView {
     const top = Math.max(Math.hypot(first[0] - bx, first[1] - by) < 0.05 ? first[2] : bz, 0.02);
     this.base = new THREE.Mesh(new THREE.CylinderGeometry(0.13, 0.19, top, 32).rotateX(Math.PI / 2), this.materials.base);
     this.base.position.set(bx, by, top / 2);
+    this.objects = new THREE.Group();
+    for (const { corners, triangles, name } of header.objects ?? []) {
+      const geometry = new THREE.BufferGeometry();
+      geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(corners), 3));
+      geometry.setIndex(triangles);
+      const mesh = new THREE.Mesh(geometry, this.materials.object);
+      mesh.name = name;
+      this.objects.add(mesh);
+    }
     const way = (most, radius, onTop) => {
       const made = new Way(most, radius, new THREE.MeshBasicMaterial({ depthTest: !onTop, transparent: onTop }));
       if (onTop) made.mesh.renderOrder = 10;
@@ -186,7 +195,7 @@ export class ReplayView {
     const corners = header.watched.map(([x, y]) => new THREE.Vector3(x, y, 0.01));
     this.lines.watched.show(corners.length ? [...corners, corners[0]] : [new THREE.Vector3()]);
     this.scene.add(
-      this.robot.group, this.shell.group, this.surfaces.group, this.stop.group, this.person.group, this.volumeGroup, this.base, ...Object.values(this.lines).map((one) => one.mesh),
+      this.robot.group, this.shell.group, this.surfaces.group, this.stop.group, this.person.group, this.volumeGroup, this.base, this.objects, ...Object.values(this.lines).map((one) => one.mesh),
     );
     this.shown = { meshes: true, person: true, volumes: true, skeleton: true, stop: true, paths: true, distance: true };
     this.paint(colours);
@@ -197,7 +206,7 @@ export class ReplayView {
   paint(colours) {
     const { materials, lines } = this;
     this.scene.background = new THREE.Color(colours.stage);
-    for (const [name, material] of Object.entries(materials)) material.color.set(colours[["mesh", "shell"].includes(name) ? "robot" : name]);
+    for (const [name, material] of Object.entries(materials)) material.color.set(colours[{ mesh: "robot", shell: "robot", object: "base" }[name] ?? name]);
     for (const [name, one] of Object.entries(lines)) one.mesh.material.color.set(colours[name === "watched" ? "volume" : name]);
     if (this.grid) {
       this.scene.remove(this.grid);
