@@ -332,7 +332,7 @@ def plan(
     programme = assembly.programme(run_config, log, model)
     sink.notes["plan"].extend(programme.notes)
     moved = assembly.followers(run_config, programme, int(people.states.t_ns[0]))
-    sink.notes["plan"].extend(assembly.scene_notes(moved))
+    sink.notes["plan"].extend(assembly.scene_notes(run_config, log, moved))
     batches = (people.states.rows(slice(i, i + _BATCH)) for i in range(0, len(people), _BATCH))
     around = assembly.surroundings(run_config, model)
     for _ in stages.plan_batches(batches, around, moved, stages.store_every(run_config), sink):

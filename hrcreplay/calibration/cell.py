@@ -75,6 +75,17 @@ class Watched(BaseModel):
         return ConvexPolygon.of_corners(np.array(self.corners_m))
 
 
+class SeenBy(BaseModel):
+    """What a camera sees: a pyramid along the z axis of its pose."""
+
+    model_config = _STRICT
+
+    fov_deg: Annotated[list[Annotated[float, Field(gt=0.0, lt=180.0)]], Field(min_length=2, max_length=2)]
+    """Whole field of view across and down [deg]."""
+    range_m: Annotated[float, Field(gt=0.0, le=1000.0)] = 100.0
+    """Greatest distance at which it shows people [m]."""
+
+
 @dataclass(frozen=True)
 class Cell:
     """Poses and clocks of one cell, and the area that its cameras watch."""
@@ -84,6 +95,7 @@ class Cell:
     T_world_base: Floats | None = None  #: (4, 4) robot base
     watched: Watched | None = None  #: area in which every person is seen by a camera
     objects: tuple[CellObject, ...] = ()  #: what stands in the cell
+    views: Mapping[str, SeenBy] = field(default_factory=dict)  #: camera -> what it sees
     residuals: tuple[Residual, ...] = ()
     notes: tuple[str, ...] = ()  #: uncertain results of calibrate
 
@@ -101,6 +113,8 @@ class Cell:
             cell["watched"] = self.watched.model_dump()
         if self.objects:
             cell["objects"] = [one.to_dict() for one in self.objects]
+        if self.views:
+            cell["views"] = {name: view.model_dump() for name, view in self.views.items()}
         if self.residuals:
             cell["residuals"] = [residual.model_dump() for residual in self.residuals]
         if self.notes:
@@ -129,6 +143,7 @@ class Cell:
             T_world_base=None if base is None else np.array(base),
             watched=file.watched,
             objects=read_objects(file.objects, where, folder),
+            views=file.views,
             residuals=tuple(file.residuals),
             notes=tuple(file.notes),
         )
@@ -179,6 +194,9 @@ def _toml(cell: Cell) -> str:
         text += [f"clock_offset_s = {entry['clock_offset_s']!r}"]
     if "watched" in table:
         text += ["", "[watched]", *(f"{key} = {value!r}" for key, value in table["watched"].items())]
+    for name, view in table.get("views", {}).items():
+        text += ["", f"[views.{json.dumps(name, ensure_ascii=False)}]"]
+        text += [f"{key} = {value!r}" for key, value in view.items()]
     for one in table.get("objects", []):
         text += ["", "[[objects]]"]
         text += [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in one.items()]
@@ -241,6 +259,7 @@ class _CellFile(BaseModel):
     T_world_base: _Base | None = None
     watched: Watched | None = None
     objects: Annotated[list[CellObject], Field(max_length=MOST_OBJECTS)] = []
+    views: dict[str, SeenBy] = {}
     residuals: list[Residual] = []
     notes: list[str] = []
 
@@ -257,6 +276,9 @@ _RIGHT = {
     "clear_s": "a time of 0 or more [s]",
     "speed_m_per_s": "a speed above 0 [m/s]",
     "objects": f"up to {MOST_OBJECTS} tables [[objects]]",
+    "views": "a table",
+    "fov_deg": "[across, down], whole angles between 0 and 180 [deg]",
+    "range_m": "a distance above 0 [m]",
     "shape": f"one of {', '.join(SHAPES)}",
     "name": "a short text",
     "residuals": f"tables with {', '.join(Residual.model_fields)}",

@@ -288,6 +288,7 @@ def _programme(run_config: RunConfig, log: Log, start_ns: int) -> tuple[PlacedPr
     found = assembly.programme(run_config, log, robot)
     static = assembly.static_scene(run_config, robot, found.path, found.start_s(start_ns))
     notes = (*found.notes, *(() if static is None else static.notes))
+    notes = (*notes, *assembly.hidden_area_notes(run_config, log, robot))
     return PlacedProgramme(base, found.path, found.start_s(start_ns), found.recorded), notes
 
 

@@ -184,7 +184,7 @@ def run_stages(
         programme = assembly.programme(run_config, log, robot)
         sink.notes["plan"].extend(programme.notes)
         moved = assembly.followers(run_config, programme, int(ticks_ns[0]))
-        sink.notes["plan"].extend(assembly.scene_notes(moved))
+        sink.notes["plan"].extend(assembly.scene_notes(run_config, log, moved))
         every = stages.store_every(run_config) if "predict" in todo else math.inf
         flow = stages.plan_batches(states, assembly.surroundings(run_config, robot), moved, every, sink)
     elif "predict" in todo:

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from hrcreplay.calibration.cell import Cell
 from hrcreplay.calibration.cell_objects import CellObject
+from hrcreplay.calibration.hidden_areas import CameraView, hidden_floor, hidden_notes
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.human.fusion import inverse_kinematics
 from hrcreplay.human.fusion.vacancy import WatchedArea
@@ -545,10 +546,39 @@ def followers(run_config: RunConfig, given: RunProgramme, start_ns: int) -> dict
     return found
 
 
-def scene_notes(moved: Mapping[str, Follower]) -> tuple[str, ...]:
-    """Returns notes on what the robots of a run keep clear of beside people."""
-    static = next(iter(moved.values())).static
-    return () if static is None else static.notes
+def scene_notes(run_config: RunConfig, log: LogLike, moved: Mapping[str, Follower]) -> list[str]:
+    """Returns notes on what the robots of a run keep clear of beside people, and on where objects hide people."""
+    one = next(iter(moved.values()))
+    static = one.static
+    return [*(() if static is None else static.notes), *hidden_area_notes(run_config, log, one.robot)]
+
+
+def hidden_area_notes(run_config: RunConfig, log: LogLike, model: RobotModel) -> list[str]:
+    """Returns notes on where near the robot somebody may be whom no camera sees; none for a cell without objects.
+
+    Raises:
+        SettingsError: The cell names the view of a camera that the log does not have.
+    """
+    cell = run_config.cell or Cell()
+    unknown = sorted(set(cell.views) - set(log.header.cameras))
+    if unknown:
+        raise SettingsError(
+            f"cell: views.{unknown[0]}: not in the log; its cameras are {', '.join(log.header.cameras)}"
+        )
+    if not cell.objects:
+        return []
+    missing = [name for name in log.header.cameras if name not in cell.views]
+    if missing:
+        needed = f"the cell file does not say what {missing[0]} sees (views.{missing[0]}, fov_deg)"
+        return [f"cameras: where objects hide people is not known, as {needed}"]
+    poses = {**log.header.T_world_camera, **cell.T_world_camera}
+    views = []
+    for name in log.header.cameras:
+        across, down = (0.5 * np.radians(whole) for whole in cell.views[name].fov_deg)
+        views.append(CameraView(poses[name], (float(across), float(down)), cell.views[name].range_m))
+    hulls = [(hull.vertices_m, hull.radius_m) for hull in static_hulls(cell.objects, model)]
+    base_m = model.T_world_base[:3, 3]
+    return hidden_notes(hidden_floor(views, hulls, base_m), base_m)
 
 
 def robot_base(run_config: RunConfig, log: LogLike) -> Floats:

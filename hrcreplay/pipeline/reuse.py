@@ -79,7 +79,7 @@ def dependencies(run_config: RunConfig, log: LogLike, ticks_ns: Ints) -> dict[st
         base = assembly.known_robot_base(run_config, log)
         found |= {
             "base": None if base is None else base.tolist(),
-            "objects": [] if run_config.cell is None else [one.to_dict() for one in run_config.cell.objects],
+            "objects": _objects(run_config),
             "programme": _programme(run_config, log, {key: settings["logs"][key] for key in _JOINT_SETTINGS}),
             "settings robot": [_without(settings["robot"], "urdf", "packages"), urdf_digest(run_config.settings)],
             "settings plan": _without(settings["plan"], "task"),
@@ -91,6 +91,14 @@ def _programme(run_config: RunConfig, log: LogLike, joint_settings: dict[str, An
     """Returns what the programme and the robot as recorded depend on, beside the log."""
     task = run_config.task or log.header.task
     return [task, joint_settings] if task and log.header.joint_topics else task or joint_settings
+
+
+def _objects(run_config: RunConfig) -> list[Any]:
+    """Returns the objects of the cell and what its cameras see, which the notes of a plan depend on."""
+    cell = run_config.cell
+    if cell is None:
+        return []
+    return [*(one.to_dict() for one in cell.objects), *(view.model_dump() for view in cell.views.values())]
 
 
 def stage_digests(run_config: RunConfig, found: Mapping[str, str]) -> dict[str, str]:

@@ -71,7 +71,7 @@ def test_refuses_to_overwrite(tmp_path: Path) -> None:
     ("text", "tokens"),
     [
         ("x", "not TOML"),
-        ("cams = 1", "'cams' | cameras, T_world_base, watched, objects, residuals, notes"),
+        ("cams = 1", "'cams' | cameras, T_world_base, watched, objects, views, residuals, notes"),
         ("cameras = 3", "cameras | 3 | table"),
         ("[cameras.k]", "cameras.k.T_world_camera | missing | 4 rows of 4"),
         (f"[cameras.k]\nT_world_camera = {EYE}\nfov = 1", "cameras.k | 'fov' | T_world_camera"),

@@ -45,6 +45,7 @@ def test_the_record_has_the_nearest_object_and_pair_of_links(folder: Path) -> No
     assert (motion["self_link"] != motion["self_other_link"]).all()
     notes = run_folder.read_meta(folder)["notes"]
     assert any("rack" in note and "tool may approach it" in note for note in notes)
+    assert any("out of sight" in note and "crouches" in note for note in notes)
 
 
 def test_why_reproduces_a_tick_beside_objects_and_names_the_nearest(folder: Path) -> None:
@@ -96,3 +97,11 @@ def test_an_srdf_alone_keeps_the_links_apart_that_it_does_not_disable(tmp_path: 
         *{("shoulder", "wrist"), ("shoulder", "tool"), ("upper_arm", "wrist"), ("upper_arm", "tool")}
     }
     assert run_folder.read_meta(folder)["srdf"] == [["link_1", "link_3"]]
+
+
+def test_without_the_cameras_views_a_note_says_that_hidden_places_are_not_known(tmp_path: Path) -> None:
+    text = CELL.read_text()
+    (tmp_path / "cell.toml").write_text(text[text.index("[[objects]]") :])
+    how = {"start_s": START_S, "end_s": START_S + 0.1, "cell_file": tmp_path / "cell.toml"}
+    folder = replay.run("plan", replay.demo_log(), overrides=ALONE, out=tmp_path / "run", **how)  # type: ignore[arg-type]
+    assert any("kinect" in note and "fov_deg" in note for note in run_folder.read_meta(folder)["notes"])

@@ -279,9 +279,10 @@ def storyboard(story: Storyboard, t0_ns: int) -> Figure:
     wide_in = (drawing.COLUMN_IN - 0.1) / 2
     tall_in = wide_in * float(np.clip((high[1] - low[1]) / (high[0] - low[0]), 0.5, 1.2))
     count = len(story.scenes)
-    figure = drawing.column_figure(count * (tall_in + 0.16) + 0.5)
+    more_in = 0.14 if story.objects else 0.0  # for a second row of the legend
+    figure = drawing.column_figure(count * (tall_in + 0.16) + 0.5 + more_in)
     grid = drawing.column_panels(
-        figure, count, 2, left_in=0.03, right_in=0.03, top_in=0.34, bottom_in=0.32, gap_in=(0.16, 0.04)
+        figure, count, 2, left_in=0.03, right_in=0.03, top_in=0.34, bottom_in=0.32 + more_in, gap_in=(0.16, 0.04)
     )
     for row, scene in enumerate(story.scenes):
         for ax, side in zip(grid[row], (0, 1), strict=True):
@@ -303,9 +304,17 @@ def storyboard(story: Storyboard, t0_ns: int) -> Figure:
         Line2D([], [], color=drawing.ACTUAL, label="driven"),
         Line2D([], [], color=drawing.INK, lw=1.0, label="person"),
         Patch(color=drawing.FAINT, alpha=0.35, lw=0, label="swept volumes"),
+        *_object_handle(story.objects),
     ]
-    figure.legend(handles=handles, loc="lower center", ncols=5, bbox_to_anchor=(0.5, 0.03 / height), columnspacing=0.8)
+    columns = 3 if more_in else 5
+    place = (0.5, 0.03 / height)
+    figure.legend(handles=handles, loc="lower center", ncols=columns, bbox_to_anchor=place, columnspacing=0.8)
     return figure
+
+
+def _object_handle(objects: Sequence[StaticHull]) -> list[Patch]:
+    """Legend of the objects; nothing without them."""
+    return [Patch(fc=drawing.FAINT, ec=drawing.INK, alpha=0.4, lw=0.5, label="objects")] if objects else []
 
 
 def _robot(ends_m: Floats, story: Storyboard) -> list[RenderedHull]:
@@ -368,5 +377,6 @@ def links(pose: LinkPose, t0_ns: int, T_world_base: Floats) -> Figure:
     handles = [Patch(color=colours[name], lw=0, label=name) for name in names]
     if pose.volumes:
         handles.append(Patch(facecolor=drawing.FAINT, alpha=0.3, lw=0, label="swept volumes"))
+    handles += _object_handle(pose.objects)
     figure.legend(handles=handles, loc="lower center", ncols=4, bbox_to_anchor=(0.5, 0.03 / figure.get_figheight()))
     return figure
