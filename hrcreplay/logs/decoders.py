@@ -121,6 +121,15 @@ class GenericDecoder:
         """
         content = message.read()
         where = f"{self.topic} ({message.topic.type})"
+        try:
+            return self._read(content, where)
+        except (TypeError, ValueError) as error:
+            raise LogError(
+                f"{where}: a part by its description is of another kind ({error}); would be right: numbers for "
+                "positions and confidences, and lists for bodies and points"
+            ) from error
+
+    def _read(self, content: Any, where: str) -> list[RawSkeleton]:
         stamp_path = self.hows[0].stamp
         stamp = None if stamp_path is None else stamp_ns(_field(content, stamp_path, where), where)
         rows, met = [], False

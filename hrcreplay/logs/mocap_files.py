@@ -86,7 +86,7 @@ def _points(where: str, fields: Sequence[str], row: Sequence[str]) -> Floats:
 
 
 def read_c3d(path: Path, mapping: ImportMapping) -> Tracks:
-    """Reads the markers of a C3D file by ezc3d; the library is loaded here, as no other format needs it."""
+    """Reads the markers of a C3D file by ezc3d, which makes lost ones NaN; loaded here, as no other format needs it."""
     if not path.is_file():
         raise LogError(f"{path}: no such file; name a recording")
     import ezc3d
@@ -94,7 +94,6 @@ def read_c3d(path: Path, mapping: ImportMapping) -> Tracks:
     try:
         found = ezc3d.c3d(str(path))
         about, points = found["parameters"]["POINT"], np.asarray(found["data"]["points"], dtype=np.float64)
-        residuals = np.asarray(found["data"]["meta_points"]["residuals"], dtype=np.float64)
         names = [name for key in sorted(about) if key.startswith("LABELS") for name in about[key]["value"]]
         rate_hz, units = float(about["RATE"]["value"][0]), "".join(about.get("UNITS", {"value": []})["value"][:1])
     except (RuntimeError, OSError, KeyError, IndexError, ValueError, MemoryError) as error:
@@ -103,7 +102,6 @@ def read_c3d(path: Path, mapping: ImportMapping) -> Tracks:
     if not count or len(names) < count:
         raise LogError(f"{path}: found {count} markers with {len(names)} names; would be right: a name for each")
     table = points[:3].transpose(2, 1, 0)
-    table = np.where(residuals.reshape(-1, count, table.shape[0])[0].T[:, :, None] < 0, np.nan, table)
     t_ns = times_at(len(table), rate_of(mapping, rate_hz or None, str(path)))
     return one_body(
         t_ns, tuple(map(_without_subject, names[:count])), table, str(path), _unit(units, str(path), mapping)

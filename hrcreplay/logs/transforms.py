@@ -6,9 +6,8 @@ import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
-from itertools import islice
-from typing import ClassVar, NamedTuple
+from itertools import islice, pairwise
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -27,6 +26,9 @@ _LISTED = 6
 _STAND_INS = {"wrist": "hand", "pelvis": "middle of the hips"}  #: points told where another joint stands for them
 
 
+_STRING = re.compile(rb"([\x02-\xff])\0\0\0(?=([ -~]+))")
+
+
 class FrameName(NamedTuple):
     """A person's frame."""
 
@@ -42,18 +44,7 @@ class FrameNames:
         self.places = presets.places_of(how)
         self.joints = frozenset(key for ways in self.places.values() for keys in ways for key in keys)
         self._known: dict[str, FrameName | None] = {}
-
-    @cached_property
-    def in_bytes(self) -> re.Pattern[bytes]:
-        """Pattern of the bytes of a message that may hold such a frame."""
-        return re.compile(rb"(?i:%b)" % b"|".join(sorted(map(_loose, self.joints))))
-
-    @cached_property
-    def pair_in_bytes(self) -> re.Pattern[bytes]:
-        """Pattern of the bytes of two successive strings, parent and such a child."""
-        names = b"|".join(sorted(map(_loose, self.joints), reverse=True))
-        child = rb"[\w/.-]*?(?i:%b)(?:[_-](?:\d+|[a-z]{5}))?" % names
-        return re.compile(rb"([!-~]+)\0{0,4}[\x01-\xff]\0\0\0(%b)" % child)
+        self._of_user: dict[str, FrameName | None] = {}
 
     def match(self, frame: str) -> FrameName | None:
         """Returns joint and user of a frame; None if it is no person's, by the first pattern that fits."""
@@ -71,6 +62,11 @@ class FrameNames:
 
     def of_user(self, frame: str) -> FrameName | None:
         """Returns joint and user of a frame that may also lie between two body points; None without a user."""
+        if frame not in self._of_user:
+            self._of_user[frame] = self._with_user(frame)
+        return self._of_user[frame]
+
+    def _with_user(self, frame: str) -> FrameName | None:
         known = self.match(frame)
         if known is not None:
             return known if known.user else None
@@ -87,9 +83,17 @@ def _compile(pattern: str) -> re.Pattern[str]:
     return re.compile("".join(means.get(part, ".*" if part == "*" else re.escape(part)) for part in parts))
 
 
-def _loose(joint: str) -> bytes:
-    """Returns the pattern of a plain name with separators anywhere."""
-    return rb"[ _.-]?".join(re.escape(letter).encode() for letter in joint)
+def strings_in(data: bytes) -> list[str]:
+    """Returns the strings in a message of ROS: length in four bytes, little endian, then the characters.
+
+    Numbers may look like short strings, too. A message of another layout has none.
+    """
+    found = []
+    for length, text in _STRING.findall(data):
+        whole = text[: length[0]].rstrip(b"\0")
+        if len(whole) >= length[0] - 1:  # a string of CDR ends with a zero that counts
+            found.append(whole.decode().lstrip("/"))
+    return found
 
 
 @dataclass(frozen=True)
@@ -112,14 +116,17 @@ class Link:
 
 def links_of(message: Message) -> Iterator[Link]:
     """Yields the transforms of a message; frames without a leading slash. Raises Undecodable."""
-    for transform in message.read().transforms:
-        at, q = transform.transform.translation, transform.transform.rotation
-        yield Link(
-            str(transform.header.frame_id).lstrip("/"),
-            str(transform.child_frame_id).lstrip("/"),
-            np.array([at.x, at.y, at.z], dtype=np.float64),
-            np.array([q.x, q.y, q.z, q.w], dtype=np.float64),
-        )
+    yield from map(_link, message.read().transforms)
+
+
+def _link(transform: Any) -> Link:
+    at, q = transform.transform.translation, transform.transform.rotation
+    return Link(
+        str(transform.header.frame_id).lstrip("/"),
+        str(transform.child_frame_id).lstrip("/"),
+        np.array([at.x, at.y, at.z], dtype=np.float64),
+        np.array([q.x, q.y, q.z, q.w], dtype=np.float64),
+    )
 
 
 @dataclass(frozen=True)
@@ -140,13 +147,12 @@ def survey_people(messages: Iterable[Message], names: FrameNames, static: Mappin
         names: Names of people's frames.
         static: Child -> link of /tf_static, for joints that do not move within their parent.
     """
-    met: set[tuple[bytes, bytes]] = set()
+    met: set[tuple[str, str]] = set()
     pairs: dict[tuple[str, str], None] = {}
     for message in messages:
-        if not names.in_bytes.search(message.data):
-            continue
-        found = set(names.pair_in_bytes.findall(message.data))
-        if found and found <= met:
+        strings = strings_in(message.data)
+        found = {(parent, child) for parent, child in pairwise(strings) if names.match(child)}
+        if strings and found <= met:
             continue
         met |= found
         pairs.update(dict.fromkeys((link.parent, link.child) for link in links_of(message)))
@@ -256,10 +262,11 @@ class TfDecoder:
     def rows(self, message: Message) -> list[RawSkeleton]:
         """Returns the frames that this message completes."""
         rows: list[RawSkeleton] = []
-        if not self._names.in_bytes.search(message.data):
+        strings = strings_in(message.data)
+        if strings and not any(map(self._names.match, strings)):
             return rows
-        for transform, link in zip(message.read().transforms, links_of(message), strict=True):
-            found = self._place(link)
+        for transform in message.read().transforms:
+            found = self._place(transform.header.frame_id.lstrip("/"), transform.child_frame_id.lstrip("/"))
             if found is None:
                 continue
             camera, name, up = found
@@ -269,20 +276,20 @@ class TfDecoder:
                 rows.append(self._finish(person, camera, name.user))
             if not person.links:
                 person.first_ns = capture_ns
-            person.links[name.joint] = (up, link)
+            person.links[name.joint] = (up, _link(transform))
             if person.links.keys() >= (person.known if len(person.known) >= _LEAST_JOINTS else _OPENNI):
                 rows.append(self._finish(person, camera, name.user))
         return rows
 
-    def _place(self, link: Link) -> tuple[str, FrameName, str | None] | None:
+    def _place(self, parent: str, child: str) -> tuple[str, FrameName, str | None] | None:
         """Returns camera, name and the joint above of a person's frame; None if it is not one."""
-        name = self._names.match(link.child)
-        within = name if name is not None and name.user else self._names.of_user(link.child)
-        up = self._names.of_user(link.parent) if within is not None else None
+        name = self._names.match(child)
+        within = self._names.of_user(child)
+        up = self._names.of_user(parent) if within is not None else None
         if within is not None and up is not None and up.user == within.user:
             camera = self._roots.get(within.user)
             return None if camera is None else (camera, within, up.joint)
-        camera = camera_of(link.parent)
+        camera = camera_of(parent)
         if name is None or camera not in self.cameras:
             return None
         self._roots[name.user] = camera

@@ -327,6 +327,20 @@ def test_numbers_one_after_another(tmp_path: Path) -> None:
         own.read(open_log(path, Logs(decoders=(Decoder(**given, numbers=7),))))
 
 
+@pytest.mark.parametrize(
+    "change", [{"confidence": "poses.orientation"}, {"confidence": "header"}, {"body": "orientation"}]
+)
+def test_parts_of_another_kind_say_where(change: dict[str, Any], tmp_path: Path) -> None:
+    def message(store: Typestore, stamp: int) -> Any:
+        poses = [make(store, "geometry_msgs/msg/Pose", position=point(store, xyz)) for xyz in body(0).values()]
+        return make(store, "geometry_msgs/msg/PoseArray", header=header(store, stamp, "cam"), poses=poses)
+
+    path = write_frames(tmp_path / "a", "mcap", "/skeleton", "geometry_msgs/msg/PoseArray", message)
+    how = Decoder(topic="/skeleton", points="poses", index="points", **change)
+    with pytest.raises(LogError, match=facts("/skeleton (geometry_msgs/PoseArray)")):
+        own.read(open_log(path, Logs(decoders=(how,))))
+
+
 def test_markers_by_namespace_and_alpha(tmp_path: Path) -> None:
     """Markers of a layout of one's own: bodies by namespace, names in the text, confidence in the alpha."""
 

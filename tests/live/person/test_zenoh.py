@@ -26,7 +26,7 @@ from hrcreplay.settings.sections import ZenohKey
 from tests.facts import facts, tells
 from tests.live import zenoh_publisher
 from tests.live.human import Human
-from tests.logs.bags import make, marker_array, store_of, transform
+from tests.logs.bags import define, header, make, marker_array, point, store_of, transform
 
 NOW_NS = 1_800_000_000_000_000_000
 MARKER_KEY = "0/cell/kinect/visualization_msgs::msg::dds_::MarkerArray_/RIHS01_0"
@@ -106,6 +106,37 @@ def test_transforms_of_a_tracker() -> None:
     (found,) = skeletons(list(stream.take("0/tf/tf2_msgs::msg::dds_::TFMessage_/RIHS01_0", data, NOW_NS)))
     assert found.capture_ns == NOW_NS - 10**7
     assert found.points[3 * POINTS.index("head")] == sorted(OPENNI_JOINTS).index("head")
+
+
+def test_a_type_with_a_preset_needs_its_definition_alone() -> None:
+    store = store_of("ros2")
+    define(store, "ros_openpose/msg/BodyPart", "float32 score\ngeometry_msgs/Point32 point")
+    define(store, "ros_openpose/msg/Person", "ros_openpose/BodyPart[] bodyParts")
+    define(store, "ros_openpose/msg/Frame", "std_msgs/Header header\nros_openpose/Person[] persons")
+    parts = [
+        make(store, "ros_openpose/msg/BodyPart", score=0.5, point=point(store, (k, 0.0, 2.0), "Point32"))
+        for k in range(25)
+    ]
+    person = make(store, "ros_openpose/msg/Person", bodyParts=parts)
+    frame = make(store, "ros_openpose/msg/Frame", header=header(store, NOW_NS - 10**7), persons=[person])
+    data = bytes(store.serialize_cdr(frame, "ros_openpose/msg/Frame"))
+    parts_of_type = {  # complete, as in an MCAP file
+        "": "std_msgs/Header header\nros_openpose/Person[] persons",
+        "ros_openpose/Person": "ros_openpose/BodyPart[] bodyParts",
+        "ros_openpose/BodyPart": "float32 score\ngeometry_msgs/Point32 point",
+        "geometry_msgs/Point32": "float32 x\nfloat32 y\nfloat32 z",
+        "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id",
+        "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
+    }
+    definition = "\n".join(f"{'=' * 80}\nMSG: {name}\n{text}" if name else text for name, text in parts_of_type.items())
+    key = ZenohKey(key="cell/op", payload="cdr", type="ros_openpose/msg/Frame", definition=definition)
+    sent = list(CameraSubscription("cam", key).take("cell/op", data, NOW_NS))
+    assert notes(sent) == []
+    (found,) = skeletons(sent)
+    assert found.capture_ns == NOW_NS - 10**7
+    assert found.points[3 * POINTS.index("neck")] == 1.0
+    assert found.points[3 * POINTS.index("elbow_l")] == 6.0
+    assert found.confidence[POINTS.index("neck")] == 0.5
 
 
 def test_a_stamp_of_zero_is_the_receipt_and_told_once() -> None:
