@@ -333,14 +333,19 @@ class TfDecoder:
 def describe_transforms(messages: Iterable[Message]) -> str:
     """Describes the frames of a tf topic in a few words, from its first messages."""
     children: dict[str, None] = {}
+    within: dict[str, set[str]] = defaultdict(set)
     for message in islice(messages, _PEEK):
-        children.update(dict.fromkeys(str(transform.child_frame_id) for transform in message.read().transforms))
+        for transform in message.read().transforms:
+            children[str(transform.child_frame_id)] = None
+            within[str(transform.header.frame_id)].add(str(transform.child_frame_id))
     more = f" and {len(children) - _LISTED} more" if len(children) > _LISTED else ""
-    return (
-        f"has the frames {', '.join(list(children)[:_LISTED])}{more}; known are those of openni_tracker (head_1, "
-        f"torso_1, left_elbow_1...), NITE, Kinect, Azure and ROS4HRI; joints of other names {DECODABLE} by its frames "
-        "and index"
+    told = (
+        f"has the frames {', '.join(list(children)[:_LISTED])}{more}; known names are those of openni_tracker (head_1, "
+        "torso_1, left_elbow_1...), NITE, Kinect, Azure and ROS4HRI"
     )
+    if any(len(frames) >= _LEAST_JOINTS for frames in within.values()):
+        return f"{told}; joints of other names {DECODABLE} by its frames and index"
+    return f"{told}, at least {_LEAST_JOINTS} in one frame"
 
 
 #: Frames of /tf_static that count as world and robot base, if the settings name none.

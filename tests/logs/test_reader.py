@@ -260,7 +260,7 @@ def one_polygon(write: Write, store: Typestore) -> None:
     [
         (numbers, ("/landmarks (std_msgs/Float32MultiArray)", "'data'"), True),
         (few_numbers, ("/landmarks (std_msgs/Float32MultiArray)", "points"), False),
-        (frames_of_another_tracker, ("SpineMid_1, Neck_1, ElbowLeft_1", "names"), True),
+        (frames_of_another_tracker, ("SpineMid_1, Neck_1, ElbowLeft_1", "names"), False),
         (one_polygon, ("'points' (up to 3)",), True),
     ],
 )
