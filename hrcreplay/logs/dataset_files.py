@@ -49,7 +49,8 @@ def unpickle_arrays(path: Path) -> Any:
     except FileNotFoundError as error:
         raise LogError(f"{path}: no such file; name a recording") from error
     except Exception as error:  # a spoilt pickle may raise anything
-        raise LogError(f"{path}: is no pickle that can be read safely ({error}); take the set's own file") from error
+        told = " ".join(str(error).split())
+        raise LogError(f"{path}: is no pickle that can be read safely ({told}); take the set's own file") from error
 
 
 def read_chico(path: Path, mapping: ImportMapping) -> Tracks:

@@ -97,7 +97,8 @@ def read_c3d(path: Path, mapping: ImportMapping) -> Tracks:
         names = [name for key in sorted(about) if key.startswith("LABELS") for name in about[key]["value"]]
         rate_hz, units = float(about["RATE"]["value"][0]), "".join(about.get("UNITS", {"value": []})["value"][:1])
     except (RuntimeError, OSError, KeyError, IndexError, ValueError, MemoryError) as error:
-        raise LogError(f"{path}: is no C3D file that can be read ({error}); export it again") from error
+        told = " ".join(str(error).split())
+        raise LogError(f"{path}: is no C3D file that can be read ({told}); export it again") from error
     count = points.shape[1]
     if not count or len(names) < count:
         raise LogError(f"{path}: found {count} markers with {len(names)} names; would be right: a name for each")

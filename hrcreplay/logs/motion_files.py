@@ -26,6 +26,7 @@ from hrcreplay.settings.sections import Axis, Finite, Positive, Section, is_rota
 TIME_UNITS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 _SKIN = "plug_in_gait"
 _SKIN_CONFIDENCE = 0.5  # markers on the skin, as for the optical targets of KERAAL
+_FAR = 1e9  # in any unit, no coordinate of a person
 _LATEST_NS = 9e18  # near the end of int64
 _FEW = 10  # with fewer frames, proportions are not judged
 _HIPS_M = 0.01  # the middle of the hips this close to the origin in nearly all frames is the origin
@@ -153,6 +154,10 @@ def body_points(track: Tracks, form: Format, mapping: ImportMapping, where: str)
     name, wanted = _order(track, form, mapping, where)
     found, confidence = _by_order(track, wanted)
     notes = []
+    absurd = np.asarray((np.abs(found) > _FAR).any(axis=2))
+    if absurd.any():
+        found[absurd], confidence[absurd] = np.nan, 0.0
+        notes.append(f"{absurd.sum()} points with a coordinate beyond {_FAR:g} made missing")
     if name == _SKIN:
         confidence = np.where(confidence > 0, _SKIN_CONFIDENCE, 0.0)
         notes.append("markers on the skin are used as joints, with errors of a few centimetres: confidence 0.5")

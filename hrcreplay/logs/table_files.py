@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.logs.decoders import number_of
@@ -60,9 +63,11 @@ def _load(path: Path, mapping: ImportMapping) -> pd.DataFrame:
     ending = path.name.lower().removesuffix(".gz").rpartition(".")[2]
     try:
         if ending == "parquet":
-            return pd.read_parquet(path)
+            columns = pq.read_table(path)
+            nested = any(pa.types.is_nested(field.type) for field in columns.schema)
+            return _flat_table(columns.to_pylist()) if nested else columns.to_pandas()
         if ending in ("json", "jsonl"):
-            return pd.json_normalize(_records(path, mapping, by_line=ending == "jsonl"))
+            return _flat_table(_records(path, mapping, by_line=ending == "jsonl"))
         return pd.read_csv(path, sep=mapping.separator, skiprows=mapping.skip, skipinitialspace=True)
     except FileNotFoundError as error:
         raise LogError(f"{path}: no such file; name a recording") from error
@@ -75,6 +80,20 @@ def _load(path: Path, mapping: ImportMapping) -> pd.DataFrame:
     ) as error:  # the parsers' own errors are ValueErrors
         told = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise LogError(f"{path}: cannot be read as a table ({told}); would be right: CSV, Parquet or JSON") from error
+
+
+def _flat_table(records: list[dict[str, Any]]) -> pd.DataFrame:
+    """Returns a table of nested records: tables and lists in them become columns named by their path, as points.0.x."""
+    return pd.DataFrame([dict(_flat(record, "")) for record in records])
+
+
+def _flat(content: Any, path: str) -> Iterator[tuple[str, Any]]:
+    items = content.items() if isinstance(content, dict) else enumerate(content) if isinstance(content, list) else None
+    if items is None:
+        yield path, content
+        return
+    for name, part in items:
+        yield from _flat(part, f"{path}.{name}" if path else str(name))
 
 
 def _records(path: Path, mapping: ImportMapping, *, by_line: bool) -> list[Any]:

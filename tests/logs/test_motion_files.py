@@ -12,10 +12,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import typer
 
+from hrcreplay.cli.app import app
 from hrcreplay.commands.inputs import import_files
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.logs.dataset_files import unpickle_arrays
+from hrcreplay.logs.formats import FORMATS
 from hrcreplay.logs.messages import AZURE_INDEX, AZURE_JOINTS, KINECT2_INDEX
 from hrcreplay.logs.reader import open_log
 from hrcreplay.records import NOBODY, POINTS, CameraFrames, Floats
@@ -93,6 +96,15 @@ def test_tables_with_a_row_per_frame(ending: str, more: str, tmp_path: Path) -> 
     check(frames)
     assert tells(notes, "times", "1", "added")
     assert not tells(notes, "lack")
+
+
+@pytest.mark.parametrize("ending", ["json", "jsonl", "parquet"])
+def test_records_with_lists_of_points(ending: str, tmp_path: Path) -> None:
+    records = [{"t": i / RATE, "person": {"points": MOTION[i].tolist()}} for i in range(len(MOTION))]
+    mapping = WIDE + 'columns = "person.points.{point}.{axis}"\naxis_names = ["0", "1", "2"]\nindex = "points"\n'
+    more = 'records = "take.rows"' if ending == "json" else ""
+    frames, _ = imported("table", write_table(tmp_path / f"a.{ending}", records), tmp_path, mapping=mapping + more)
+    check(frames)
 
 
 def test_table_of_other_columns_units_axes_and_names(tmp_path: Path) -> None:
@@ -638,6 +650,16 @@ class Evil:
         return (Path.touch, (self.path,))
 
 
+def test_absurd_coordinates_are_made_missing(tmp_path: Path) -> None:
+    records = writers.wide(MOTION, [i / RATE for i in range(len(MOTION))])
+    records[4]["head_y"] = 1e200
+    frames, notes = imported("table", write_table(tmp_path / "a.jsonl", records), tmp_path, mapping=WIDE)
+    assert np.isnan(frames.points_m[4, at("head")]).all()
+    assert frames.confidence[4, at("head")] == 0.0
+    assert np.isfinite(frames.points_m[5, at("head")]).all()
+    assert tells(notes, "1 points", "missing")
+
+
 @pytest.mark.parametrize("kind", ["chico", "harper"])
 def test_pickles_run_nothing(kind: str, tmp_path: Path) -> None:
     touched = tmp_path / "touched"
@@ -717,3 +739,14 @@ def test_mediapipe_as_reported_is_read_with_the_order_of_its_points(tmp_path: Pa
 def test_opening_such_a_file_as_a_log_names_the_import(name: str, kinds: str) -> None:
     with pytest.raises(LogError, match=facts("hrcreplay import", kinds, name)):
         open_log(data_path(f"reported/txt/{name}"))
+
+
+def test_help_and_guide_name_every_kind() -> None:
+    command = typer.main.get_command(app).commands["import"]  # type: ignore[attr-defined]
+    kinds = next(parameter for parameter in command.params if parameter.name == "kind").help
+    guide = (Path(__file__).parents[2] / "docs" / "guide.md").read_text()
+    for kind in FORMATS:
+        assert tells(kinds, kind)
+        assert f"`{kind}`" in guide
+    with pytest.raises(SettingsError, match=facts("'abc'", *FORMATS, "azure", "kinect2", "keraal")):
+        import_files("abc", ["a"], Path("b.mcap"))
