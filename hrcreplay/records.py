@@ -227,6 +227,15 @@ class HumanStates(Table):
     nobody_else_s: Floats | None = None  #: (n,) the same, apart from the person [s]; inf before the first time
 
 
+class AxisFrame(NamedTuple):
+    """Links at both sides of an axis of a robot, by which a log may contain its position."""
+
+    parent: str
+    child: str
+    R_parent_joint: Floats  #: (3, 3) of the child in the parent, with the axis at zero
+    axis: Floats  #: (3,) unit vector in the child
+
+
 class SweptVolume(NamedTuple):
     """Reachable space of one limb at one tick: the convex hull of its vertices + a ball."""
 

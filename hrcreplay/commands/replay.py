@@ -118,7 +118,7 @@ def complete(run_config: RunConfig, log: Log, writer: RunWriter, watch: Stopwatc
         meta: Entries of run.json so far.
     """
     base = assembly.known_robot_base(run_config, log)
-    if log.header.joint_topics:
+    if log.header.joint_topics or meta["counts"].get("joint_gaps_ms"):
         meta["programme"] = "task" if run_config.task or log.header.task else "recorded joints"
     writer.close_tables()
     meta |= _describe_results(run_config, log, writer.partial, meta, meta["notes"])

@@ -11,14 +11,15 @@ from array import array
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.logs.log_files import LogFiles
 from hrcreplay.logs.messages import Message, Undecodable, stamp_ns, topic_list
-from hrcreplay.records import Bools, Floats, Ints, Table
+from hrcreplay.records import AxisFrame, Bools, Floats, Ints, Table
 from hrcreplay.settings.sections import Logs
 
 _ROS, _OWN = "sensor_msgs/JointState", "hrcreplay.JointState"
@@ -150,6 +151,83 @@ def _read_topic(source: LogFiles, name: str, defects: Counter[str]) -> JointTopi
         for joint, (rows, values, rates) in joints.items()
     }
     return JointTopic(name, _ints(arrival), _ints(stamp), series)
+
+
+#: Maximum turn of a link about other than its axis, as frames are rounded [rad].
+_ASIDE_RAD = 0.02
+
+
+def read_frames(
+    source: LogFiles, names: Sequence[str], axes: Sequence[str], frames: Sequence[AxisFrame], defects: Counter[str]
+) -> JointTopic | None:
+    """Reads the robot's axes from the poses of its links; None if the log lacks the link of an axis.
+
+    A pose counts if it is that of an axis' child link in its parent link. The position is the turn about the axis.
+
+    Args:
+        source: The log's files.
+        names: Topics of transforms.
+        axes: The robot's joints, from the base on.
+        frames: Links at both sides of each axis.
+        defects: Receives the number of messages left out.
+
+    Raises:
+        LogError: A link turns about another axis than that of the robot.
+    """
+    of = {(frame.parent, frame.child): (axis, frame) for axis, frame in zip(axes, frames, strict=True)}
+    arrival, stamp = array("q"), array("q")
+    found: dict[str, tuple[array[int], array[float]]] = {}
+    for message in source.messages(names):
+        try:
+            transforms = message.read().transforms
+        except Undecodable:
+            defects["messages_undecodable"] += 1
+            continue
+        ours = [
+            (*of[key], transform)
+            for transform in transforms
+            if (key := (transform.header.frame_id.lstrip("/"), transform.child_frame_id.lstrip("/"))) in of
+        ]
+        for axis, frame, transform in ours:
+            rows, values = found.setdefault(axis, (array("q"), array("d")))
+            rows.append(len(arrival))
+            values.append(_turn(transform, frame, axis, str(source.path)))
+        if ours:
+            t_ns = stamp_ns(ours[0][2].header.stamp, message.topic.name)
+            arrival.append(message.arrival_ns)
+            stamp.append(t_ns if 0 < t_ns < 1 << 62 else 0)
+    if len(found) < len(axes):
+        return None
+    series = {
+        axis: Samples(_ints(rows), _unwrapped(np.array(values)), np.full(len(values), np.nan))
+        for axis, (rows, values) in found.items()
+    }
+    return JointTopic(", ".join(names), _ints(arrival), _ints(stamp), series)
+
+
+def _unwrapped(q: Floats) -> Floats:
+    """Removes the jumps by full turns; a position that is not finite is left out."""
+    finite = np.isfinite(q)
+    found = q.copy()
+    found[finite] = np.unwrap(q[finite])
+    return found
+
+
+def _turn(transform: Any, frame: AxisFrame, axis: str, where: str) -> float:
+    """Position of an axis by the pose of its child link [rad]; NaN if it is no rotation."""
+    q = transform.transform.rotation
+    quaternion = np.array([q.x, q.y, q.z, q.w], dtype=np.float64)
+    if not 0.9 < float(np.linalg.norm(quaternion)) < 1.1:  # also NaN
+        return float("nan")
+    R = frame.R_parent_joint.T @ Rotation.from_quat(quaternion).as_matrix()
+    turn = Rotation.from_matrix(R).as_rotvec()
+    along = float(turn @ frame.axis)
+    if np.abs(turn - along * frame.axis).max() > _ASIDE_RAD:
+        raise LogError(
+            f"{where}: the link {frame.child} does not turn about {axis} of the robot; would be right: the URDF of the "
+            "recorded robot in robot.urdf"
+        )
+    return along
 
 
 def _ints(values: array[int]) -> Ints:

@@ -38,7 +38,7 @@ from hrcreplay.logs.transforms import (
     static_links,
     survey_people,
 )
-from hrcreplay.records import NOBODY, CameraFrames
+from hrcreplay.records import NOBODY, AxisFrame, CameraFrames
 from hrcreplay.settings.sections import Decoder, Logs
 
 _OWN = "hrcreplay.Skeleton"
@@ -381,17 +381,28 @@ class Log:
                 return f"would be right: --set logs.unit={other}, or points in {self._options.unit}"
         return "would be right: points in metres"
 
-    def joints(self, axes: Sequence[str]) -> JointTrack | None:
+    def joints(self, axes: Sequence[str], frames: Sequence[AxisFrame] = ()) -> JointTrack | None:
         """Returns the recorded track of the robot's axes; None if the log has no joint positions.
 
         Args:
             axes: The robot's joints, from the base on.
+            frames: Links at both sides of each axis; a log without joint states is searched for their poses.
 
         Raises:
             LogError: The joints of the log do not fit the robot.
             SettingsError: ``logs.joint_names`` does not.
         """
         topics = self.joint_states()
+        if not topics and frames:
+            names = [topic.name for topic in self.topics if topic.type in TF_TYPES]
+            by_links = joints.read_frames(self._source, names, axes, frames, self._track) if names else None
+            if by_links is not None:
+                track = self.read_joints([by_links], axes).track
+                told = (
+                    f"robot joints: from the poses of its links on {by_links.name}, each first within half a turn of 0"
+                )
+                self.joint_notes = (told, *self.joint_notes)
+                return track
         return self.read_joints(topics, axes).track if topics else None
 
     def read_joints(self, topics: Sequence[JointTopic], axes: Sequence[str]) -> JointReading:

@@ -32,6 +32,7 @@ from hrcreplay.records import (
     NOBODY,
     RECORDED,
     UNGUARDED,
+    AxisFrame,
     Bools,
     CameraFrames,
     Floats,
@@ -242,7 +243,7 @@ class LogLike(Protocol):
     def joint_notes(self) -> tuple[str, ...]:
         """Remarks of the latest reading of the joints."""
 
-    def joints(self, axes: Sequence[str], /) -> JointTrack | None:
+    def joints(self, axes: Sequence[str], frames: Sequence[AxisFrame] = (), /) -> JointTrack | None:
         """The recorded track of the robot's axes, if there is one."""
 
     def capsules(self) -> CapsuleTrack | None:
@@ -407,7 +408,7 @@ def programme(run_config: RunConfig, log: LogLike, model: RobotModel) -> RunProg
         path = _programme(parse_task(table, where), where, *parts, model.T_world_base.tobytes())
         recorded, notes = _recorded_beside_task(log, model)
         return RunProgramme(replace(path, model=model), notes, recorded=recorded)
-    track = log.joints(model.joint_names)
+    track = log.joints(model.joint_names, model.axis_frames)
     if track is None:
         empty = f" ({', '.join(log.header.joint_topics)}: no positions that go with their names)"
         raise SettingsError(
@@ -447,11 +448,11 @@ def recorded_capsules(log: LogLike, T_world_base: Floats) -> tuple[RecordedCapsu
 
 def _recorded_beside_task(log: LogLike, model: RobotModel) -> tuple[Recorded | None, tuple[str, ...]]:
     """Returns the robot as recorded in a log whose programme is a task, with remarks; None if it does not fit."""
-    if not log.header.joint_topics:
-        return recorded_capsules(log, model.T_world_base)
     try:
-        track = log.joints(model.joint_names)
-        return (None, ()) if track is None else (_recorded(track, model), log.joint_notes)
+        track = log.joints(model.joint_names, model.axis_frames)
+        if track is None:
+            return (None, ()) if log.header.joint_topics else recorded_capsules(log, model.T_world_base)
+        return _recorded(track, model), log.joint_notes
     except (LogError, SettingsError) as error:
         return None, (f"the robot as recorded is not judged: {str(error).removeprefix(f'{log.header.path}: ')}",)
 

@@ -19,7 +19,7 @@ from hrcreplay.errors import SettingsError
 from hrcreplay.geometry.small_matrices import apply, multiply
 from hrcreplay.geometry.vectors import dot_n, norm_n
 from hrcreplay.kernels import njit
-from hrcreplay.records import Bools, Floats, Ints
+from hrcreplay.records import AxisFrame, Bools, Floats, Ints
 from hrcreplay.robot import irb140 as irb140_data
 from hrcreplay.robot.link_capsules import Extent, Segment, Vector, capsules, distance_m
 from hrcreplay.robot.urdf import Description, describe, own_extent, unreadable, with_shapes
@@ -81,6 +81,7 @@ class RobotModel:
     base_frame: str  #: link that stands on ``T_world_base``
     tcp_frame: str  #: link that carries the tool
     locked: tuple[str, ...]  #: joints off the chain, locked at zero or at the nearest end of their range
+    axis_frames: tuple[AxisFrame, ...]  #: links at both sides of each axis
     tcp_in_frame_m: Floats  #: (3,) TCP in the frame of that link [m]
     tcp_outside_m: float  #: distance from the TCP to the capsules of the last link; 0 inside one, NaN without one [m]
     moves: Bools  #: (s, nv) axes that move each segment
@@ -292,6 +293,7 @@ def from_urdf(
         base_frame=robot.base,
         tcp_frame=robot.tcp,
         locked=robot.locked,
+        axis_frames=robot.frames,
         tcp_in_frame_m=np.array(offset.translation),
         tcp_outside_m=_outside(model, segments, points, tcp),
         moves=np.array([_support(model, point) for point in points[::2]]).reshape(-1, model.nv),

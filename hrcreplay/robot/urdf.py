@@ -16,9 +16,11 @@ from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from hrcreplay.errors import SettingsError
-from hrcreplay.records import Floats
+from hrcreplay.geometry.vectors import norm_n
+from hrcreplay.records import AxisFrame, Floats
 from hrcreplay.robot.link_capsules import KINDS, Extent, Shape, shapes
 
 _TURNING = ("revolute", "continuous")
@@ -41,6 +43,7 @@ class Description:
     q_max: Floats  #: (nv,) [rad]; inf for a continuous joint
     dq_max: Floats  #: (nv,) [rad/s]
     shapes: tuple[Shape, ...]  #: collision shapes of the links that the chain moves
+    frames: tuple[AxisFrame, ...] = ()  #: links at both sides of each axis
 
 
 def describe(xml: str, tcp_frame: str | None = None, base_frame: str | None = None) -> Description:
@@ -85,7 +88,25 @@ def describe(xml: str, tcp_frame: str | None = None, base_frame: str | None = No
         q_max=limits[1],
         dq_max=limits[2],
         shapes=found,
+        frames=tuple(_frame(joint) for joint in chain),
     )
+
+
+def _frame(joint: ET.Element) -> AxisFrame:
+    """Links at both sides of an axis, and how they are turned; zeros for a vector that is no numbers."""
+    parent, child = (str(joint.find(name).get("link")) for name in ("parent", "child"))  # type: ignore[union-attr]  # _parse has checked it
+    origin, axis = joint.find("origin"), joint.find("axis")
+    rpy = _vector(None if origin is None else origin.get("rpy"), (0.0, 0.0, 0.0))
+    along = _vector(None if axis is None else axis.get("xyz"), (1.0, 0.0, 0.0))
+    return AxisFrame(parent, child, Rotation.from_euler("xyz", rpy).as_matrix(), along / max(norm_n(along), 1e-12))
+
+
+def _vector(text: str | None, default: tuple[float, float, float]) -> Floats:
+    try:
+        found = np.array([float(part) for part in text.split()] if text is not None else default)
+    except ValueError:
+        return np.zeros(3)  # pinocchio tells what is wrong with it
+    return found if found.shape == (3,) and np.isfinite(found).all() else np.zeros(3)
 
 
 def with_shapes(robot: Description, paths: Mapping[str, str]) -> tuple[str, dict[str, str]]:

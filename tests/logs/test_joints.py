@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from hrcreplay.errors import HrcReplayError, LogError, SettingsError
 from hrcreplay.logs.info import lines, summarize
 from hrcreplay.logs.joints import JointTrack
 from hrcreplay.logs.reader import Log, open_log
-from hrcreplay.records import Floats, Ints
+from hrcreplay.records import AxisFrame, Floats, Ints
 from hrcreplay.settings.sections import Logs
 from tests.facts import facts
 from tests.logs.bags import KINDS, bag, header, make, write_openni
@@ -368,3 +369,60 @@ def test_info_says_which_joint_is_which_axis_and_how_the_clock_stands(tmp_path: 
     other = summarize(open_log(path), axes=("a", "b", "c"))
     assert other.joints[0].axes == {}
     assert any("logs.joint_names" in note for note in other.notes), "told, and the rest is described"
+
+
+# --- links instead of joints ---
+
+TF = "tf2_msgs/msg/TFMessage"
+FRAMES = tuple(
+    AxisFrame(
+        ("base", "link_1", "link_2")[k],
+        ("link_1", "link_2", "link_3")[k],
+        Rotation.from_euler("xyz", [0.3 * k, -0.7 * k, 1.1]).as_matrix(),
+        np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [0.6, 0.0, 0.8]][k]),
+    )
+    for k in range(3)
+)
+
+
+def write_links(path: Path, q_of: Callable[[int], Floats], *, links: int = 3, turned: bool = False) -> Path:
+    """A bag with a person and the poses of a robot's links, each in the link before it, 50 a second."""
+    with bag(path, "mcap") as (put, store):
+        write_openni(put, store, frames=20, start_ns=BEGIN)
+        for i in range(100):
+            t_ns, q = BEGIN + 20 * MS * i, q_of(i)
+            transforms = []
+            for k, frame in enumerate(FRAMES[:links]):
+                axis = np.roll(frame.axis, 1) if turned and k == 1 else frame.axis
+                turn = Rotation.from_matrix(frame.R_parent_joint) * Rotation.from_rotvec(q[k] * axis)
+                x, y, z, w = turn.as_quat().tolist()
+                transform = make(
+                    store,
+                    "geometry_msgs/msg/Transform",
+                    translation=make(store, "geometry_msgs/msg/Vector3", x=0.1, y=0.0, z=0.3),
+                    rotation=make(store, "geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
+                )
+                names = {"header": header(store, t_ns, frame.parent), "child_frame_id": frame.child}
+                transforms.append(make(store, "geometry_msgs/msg/TransformStamped", **names, transform=transform))
+            put("/tf", TF, t_ns + MS, make(store, TF, transforms=transforms))
+    return path
+
+
+def test_the_poses_of_the_links_are_the_joints_where_a_log_has_no_joint_states(tmp_path: Path) -> None:
+    def q_of(i: int) -> Floats:
+        return np.array([0.05 * i, 0.4 * np.sin(0.1 * i), -1.0 + 0.01 * i])  # the first goes beyond half a turn
+
+    log = open_log(write_links(tmp_path / "a", q_of))
+    track = log.joints(AXES, FRAMES)
+    assert track is not None
+    np.testing.assert_array_equal(track.t_ns, BEGIN + 20 * MS * np.arange(100))
+    np.testing.assert_allclose(track.q, [q_of(i) for i in range(100)], atol=1e-9)
+    assert "from the poses of its links on /tf" in log.joint_notes[0]
+    assert log.joints(AXES) is None
+
+
+def test_links_that_are_not_all_there_are_no_robot_and_those_of_another_are_refused(tmp_path: Path) -> None:
+    assert open_log(write_links(tmp_path / "a", lambda _: np.full(3, 0.3), links=2)).joints(AXES, FRAMES) is None
+    other = write_links(tmp_path / "b", lambda _: np.full(3, 0.3), turned=True)
+    with pytest.raises(LogError, match=facts("link_2", "lift", "robot.urdf")):
+        open_log(other).joints(AXES, FRAMES)

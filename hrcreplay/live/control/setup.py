@@ -31,7 +31,7 @@ from hrcreplay.logs.log_files import Header
 from hrcreplay.logs.reader import open_log
 from hrcreplay.pipeline import assembly
 from hrcreplay.pipeline.run_config import RunConfig, recorded_limits, resolve, resolve_without_log
-from hrcreplay.records import Floats, Ints
+from hrcreplay.records import AxisFrame, Floats, Ints
 from hrcreplay.robot.control.controllers import Controller
 from hrcreplay.robot.control.minimiser import compile_second_tries
 from hrcreplay.robot.task import Reference
@@ -49,7 +49,7 @@ class HeaderOnlyLog:
 
     joint_notes: tuple[str, ...] = ()
 
-    def joints(self, _axes: Sequence[str]) -> JointTrack | None:
+    def joints(self, _axes: Sequence[str], _frames: Sequence[AxisFrame] = ()) -> JointTrack | None:
         """None: a live robot follows a task."""
         return None
 
