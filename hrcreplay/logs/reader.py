@@ -395,13 +395,13 @@ class Log:
         topics = self.joint_states()
         if not topics and frames:
             names = [topic.name for topic in self.topics if topic.type in TF_TYPES]
-            by_links = joints.read_frames(self._source, names, axes, frames, self._track) if names else None
+            defects: Counter[str] = Counter()
+            by_links = joints.read_frames(self._source, names, axes, frames, defects) if names else None
             if by_links is not None:
+                self._track.update(defects)
                 track = self.read_joints([by_links], axes).track
-                told = (
-                    f"robot joints: from the poses of its links on {by_links.name}, each first within half a turn of 0"
-                )
-                self.joint_notes = (told, *self.joint_notes)
+                told = f"from the poses of its links on {by_links.name}, each first within half a turn of 0"
+                self.joint_notes = (f"robot joints: {told}", *self.joint_notes)
                 return track
         return self.read_joints(topics, axes).track if topics else None
 

@@ -423,6 +423,13 @@ def _note(found: Mapping[str, Any]) -> str:
     )
     if other:
         fault += f" At {other:,} of them it was another body than the person, which the robot did not consider."
+    if (ran := found["total"].get(RECORDED)) is not None:
+        logs = sum(RECORDED in log["methods"] for log in found["logs"])
+        of = f" (on {logs} of {len(found['logs'])} logs)" if logs < len(found["logs"]) else ""
+        fault += (
+            f" Recorded: the robot as it ran{of}; it and the person are both known at {ran['known_ticks']:,} of "
+            f"{ran['ticks']:,} ticks."
+        )
     still = [label for label, row in found["total"].items() if row["still_logs"]]
     fault += f" No contact of a robot that makes no way is a success: {', '.join(still)}." if still else ""
     programmed = [row["programme_speed_max_m_per_s"] or 0.0 for row in found["total"].values()]
