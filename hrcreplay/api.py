@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Self
 
@@ -42,7 +43,7 @@ from hrcreplay.robot.task import parse_task
 from hrcreplay.settings.load import load_settings
 from hrcreplay.settings.sections import Robot as RobotSettings
 from hrcreplay.store.columns import motion_columns, occupancy_columns, state_columns
-from hrcreplay.store.run_folder import RunWriter, Stopwatch, arrow_table
+from hrcreplay.store.run_folder import RunWriter, Stopwatch, arrow_table, fill_optional
 from hrcreplay.toml_file import read_toml
 
 __all__ = [
@@ -170,7 +171,7 @@ def frames(
 
 @dataclass(frozen=True)
 class People:
-    """The fused person, one row per tick."""
+    """The fused people, one row per tick and person, ordered by both; one row per tick if there was one person."""
 
     recording: Recording  #: with the span of the fused part
     states: HumanStates
@@ -181,8 +182,17 @@ class People:
         return len(self.states)
 
     def rows(self, which: slice | Ints) -> People:
-        """Selects some ticks."""
+        """Selects some rows."""
         return People(self.recording, self.states.rows(which))
+
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """Numbers of all people, from 1."""
+        return tuple(sorted(set(self.states.numbers.tolist())))
+
+    def of_person(self, number: int) -> People:
+        """The rows of one person, to predict this person alone; a plan needs all people."""
+        return People(self.recording, self.states.of_person(number))
 
     def to_pandas(self) -> pd.DataFrame:
         """Returns the columns of state.parquet: angles and their derivatives, lengths, standard deviations."""
@@ -333,7 +343,9 @@ def plan(
     sink.notes["plan"].extend(programme.notes)
     moved = assembly.followers(run_config, programme, int(people.states.t_ns[0]))
     sink.notes["plan"].extend(assembly.scene_notes(run_config, log, moved))
-    batches = (people.states.rows(slice(i, i + _BATCH)) for i in range(0, len(people), _BATCH))
+    ticks, first = people.states.ticks()
+    edges = [int(first[i]) for i in range(0, len(ticks), _BATCH)] + [len(people)]
+    batches = (people.states.rows(slice(begin, end)) for begin, end in pairwise(edges))
     around = assembly.surroundings(run_config, model)
     for _ in stages.plan_batches(batches, around, moved, stages.store_every(run_config), sink):
         pass
@@ -352,14 +364,14 @@ def report(recording: Recording, people: People, motion: Plan, out: str | Path) 
     Raises:
         SettingsError: The folder exists or cannot be created, or the person or the motion lacks ticks.
     """
-    if "state" not in people.tables or len(motion.tables["motion"]) != len(people):
+    if "state" not in people.tables or len(motion.tables["motion"]) != len(people.states.ticks()[0]):
         raise SettingsError("report: some ticks only; would be right: all ticks that fuse returned, and their plan")
     began = datetime.now(UTC)
     run_config, log = replace(motion.run_config, command="report"), recording.log
     with RunWriter(Path(out)) as writer:
         for name, table in (people.tables | motion.tables).items():
             writer.table(name, {column: table[column] for column in table.column_names})
-        parts = reuse.dependencies(run_config, log, people.states.t_ns)
+        parts = reuse.dependencies(run_config, log, people.states.ticks()[0])
         found = replay.findings(run_config, {"fuse": people.told, "plan": motion.told})
         meta = {**run_config.meta(), **found, **replay.describe_run(run_config, began, parts, smooth=False)}
         replay.complete(run_config, log, writer, Stopwatch(time.perf_counter_ns), meta)
@@ -380,7 +392,7 @@ class Fusion:
         )
 
     def update(self, found: CameraFrames | pd.DataFrame | None, t_ns: int) -> HumanStates:
-        """Computes the fused person at a tick, as a table of one row.
+        """Computes the fused people at a tick, as a table of one row per person; one row at least.
 
         Args:
             found: All frames that arrived after the previous tick and up to this one, in order and in the form that
@@ -419,14 +431,19 @@ class Controller:
         self._started: tuple[Planner, assembly.Surroundings] | None = None
 
     def step(self, person: HumanStates) -> Motion:
-        """Computes the robot's motion at a tick, one row; ``person`` is the row from ``Fusion.update``."""
+        """Computes the robot's motion at a tick, one row.
+
+        Args:
+            person: The rows from ``Fusion.update``, one per person.
+        """
         if self._started is None:
             robot = assembly.robot(self._run_config, assembly.robot_base(self._run_config, self._log))
             programme = assembly.programme(self._run_config, self._log, robot)
             (planner,) = assembly.planners(self._run_config, programme, int(person.t_ns[0])).values()
             self._started = planner, assembly.surroundings(self._run_config, robot)
         planner, around = self._started
-        return planner.follow(person.t_ns, [Forecast(around, person).predict(0)], around.names)
+        forecast = Forecast(around, person)
+        return planner.follow(forecast.t_ns, [forecast.predict(0)], around.names_of(int(person.numbers.max())))
 
     @staticmethod
     def to_pandas(steps: Sequence[Motion]) -> pd.DataFrame:
@@ -443,7 +460,10 @@ class _MemoryTables:
     def table(self, name: str, columns: Mapping[str, Any]) -> None:
         """Appends rows."""
         rows = arrow_table(columns)
-        self.tables[name] = pa.concat_tables([self.tables[name], rows]) if name in self.tables else rows
+        if name in self.tables:
+            before = fill_optional(self.tables[name], rows.column_names)
+            rows = pa.concat_tables([before, fill_optional(rows, before.column_names)])
+        self.tables[name] = rows
 
     def sink(self) -> Sink:
         """Returns a sink that keeps all output of a stage and shows no progress."""

@@ -141,7 +141,12 @@ class Table:
 
     @classmethod
     def join(cls, tables: Sequence[Self]) -> Self:
-        """One table with the rows of all tables, in the given order; fields without rows are those of the first."""
+        """One table with the rows of all tables, in the given order; fields without rows are those of the first.
+
+        Where one table names its people, all do.
+        """
+        if any(getattr(table, "person", None) is not None for table in tables):
+            tables = [replace(table, person=table.numbers) for table in tables]  # type: ignore[attr-defined,call-arg]
         first = tables[0]
         names = [name for name, value in vars(first).items() if isinstance(value, np.ndarray)]
         return replace(first, **{name: np.concatenate([getattr(t, name) for t in tables]) for name in names})
@@ -182,6 +187,12 @@ class Measurements(Table):
     points_m: Floats  #: (n, 20, 3) POINTS in the world [m]
     confidence: Floats  #: (n, 20) in [0, 1]
     cameras: tuple[str, ...]
+    person: Ints | None = None  #: (n,) number of the person, from 1; None: person 1 in all rows
+
+    @property
+    def numbers(self) -> Ints:
+        """(n,) number of the person of each row, from 1."""
+        return np.ones(len(self), np.int64) if self.person is None else self.person
 
     @property
     def angles(self) -> Floats:
@@ -206,7 +217,11 @@ class Measurements(Table):
 
 @dataclass(frozen=True)
 class HumanStates(Table):
-    """The fused person, one row per tick. Rows before the first measurement are NaN."""
+    """The fused people, one row per tick and person, ordered by both; mostly one person, and one row per tick.
+
+    Rows before the first measurement are NaN. In a row of a body that counts by its points alone, since it was only
+    just seen, all joints are NaN and ``points_m`` are the points shown.
+    """
 
     t_ns: Ints  #: (n,)
     p: Floats  #: (n, 13) JOINTS [m, m, rad..., m]; heading is unwrapped
@@ -224,7 +239,24 @@ class HumanStates(Table):
     points_m: Floats  #: (n, 20, 3) recent POINTS that cameras show away from the model, world [m]; otherwise NaN
     cameras: tuple[str, ...]
     nobody_s: Floats | None = None  #: (n,) time since the watched area was last empty [s]; None: no watched area
-    nobody_else_s: Floats | None = None  #: (n,) the same, apart from the person [s]; inf before the first time
+    nobody_else_s: Floats | None = None  #: (n,) the same, apart from the people tracked [s]; inf before the first time
+    person: Ints | None = None  #: (n,) number of the person, from 1; None: person 1 in all rows, one row per tick
+
+    @property
+    def numbers(self) -> Ints:
+        """(n,) number of the person of each row, from 1."""
+        return np.ones(len(self), np.int64) if self.person is None else self.person
+
+    def ticks(self) -> tuple[Ints, Ints]:
+        """The ticks (k,), and the first row of each with the number of rows at the end (k + 1,)."""
+        if self.person is None:
+            return self.t_ns, np.arange(len(self) + 1)
+        first = np.flatnonzero(np.diff(self.t_ns, prepend=self.t_ns[:1] - 1))
+        return self.t_ns[first], np.append(first, len(self))
+
+    def of_person(self, number: int) -> HumanStates:
+        """The rows of one person, as if there were no other."""
+        return self if self.person is None else replace(self.rows(self.person == number), person=None)
 
 
 class AxisFrame(NamedTuple):
@@ -374,3 +406,8 @@ class Motion(Table):
         }
         reason = np.array([reasons.index(row.reason) for row in rows])
         return cls(t_ns=t_ns, **columns, reason=reason, limbs=limbs, links=links, reasons=reasons)
+
+    @classmethod
+    def join(cls, tables: Sequence[Self]) -> Self:
+        """One table with the rows of all tables; volumes that only later tables name come after the others."""
+        return replace(super().join(tables), limbs=max((table.limbs for table in tables), key=len))

@@ -127,7 +127,7 @@ def printed(tmp_path_factory: pytest.TempPathFactory) -> Run:
     from hrcreplay.store import run_folder
 
     out = tmp_path_factory.mktemp("printed") / "run"
-    return run_folder.read(replay.run("plan", replay.demo_log(), out=out, config=Path("paper")))
+    return run_folder.read(replay.run("plan", replay.demo_log(), out=out, config=Path("paper"))).of_person(1)
 
 
 @pytest.fixture(scope="session")
@@ -135,4 +135,4 @@ def demo(demo_folder: Path) -> Run:
     """The same report, read."""
     from hrcreplay.store import run_folder
 
-    return run_folder.read(demo_folder)
+    return run_folder.read(demo_folder).of_person(1)

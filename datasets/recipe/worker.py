@@ -53,19 +53,37 @@ def simulate(seed: int) -> tuple[Floats, Floats]:
         (n,) instants [s] at ``RATE_HZ`` and (n, 20, 3) POINTS in the world [m].
     """
     t_s = np.arange(round(script.DURATION_S * RATE_HZ) + 1) / RATE_HZ
-    rng = np.random.default_rng(seed)
     root_m, heading = script.floor_way(t_s)
+    return t_s, body(t_s, root_m, heading, (script.LEFT, script.RIGHT), np.random.default_rng(seed))
+
+
+def body(
+    t_s: Floats,
+    root_m: Floats,
+    heading: Floats,
+    reaches: tuple[tuple[script.Reach, ...], tuple[script.Reach, ...]],
+    rng: np.random.Generator,
+) -> Floats:
+    """(n, 20, 3) POINTS in the world of a body whose way is known [m].
+
+    Args:
+        t_s: (n,) evenly spaced [s].
+        root_m: (n, 2) its place on the floor [m].
+        heading: (n,) [rad], unwrapped.
+        reaches: What the left and the right arm do, beside swinging.
+        rng: Of the aimless sway.
+    """
     steps = feet(t_s, root_m, heading, ANKLE_M)
     trunk = _trunk(t_s, root_m, heading, steps, rng)
     points = np.full((len(t_s), len(POINTS), 3), np.nan)
     for name in ("pelvis", "chest", "neck", "head"):
         points[:, POINTS.index(name)] = getattr(trunk, f"{name}_m")
-    for i, (side, s, plan) in enumerate((("l", 1.0, script.LEFT), ("r", -1.0, script.RIGHT))):
+    for i, (side, s, plan) in enumerate((("l", 1.0, reaches[0]), ("r", -1.0, reaches[1]))):
         arm = _arm(t_s, trunk, s, plan, _arm_swing(root_m, heading, steps.ankle_m[:, 1 - i]), rng)
         leg = _leg(trunk, s, steps.ankle_m[:, i], steps.yaw[:, i], steps.swing[:, i])
         for name, value in (arm | leg).items():
             points[:, POINTS.index(f"{name}_{side}")] = value
-    return t_s, points
+    return points
 
 
 def _trunk(t_s: Floats, root_m: Floats, heading: Floats, steps: Feet, rng: np.random.Generator) -> Trunk:

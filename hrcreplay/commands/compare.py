@@ -27,13 +27,13 @@ from hrcreplay.commands import replay
 from hrcreplay.commands.notes import notes_of
 from hrcreplay.errors import SettingsError
 from hrcreplay.evaluation.contact import (
+    Coverage,
     Predicted,
     compute_full_coverage,
     compute_own_coverage,
     contact_table,
     read_recorded_people,
 )
-from hrcreplay.evaluation.containment import Outcome
 from hrcreplay.evaluation.recorded_person import RecordedPeople
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.pipeline import assembly, reuse, stages
@@ -85,7 +85,7 @@ class VariantTask:
     variant: Variant
     folder: Path  #: contains state.parquet; motion and contact are written here
     people: RecordedPeople
-    full: Outcome | None  #: coverage by its volumes until the braking time; depends only on the occupancy
+    full: Coverage | None  #: coverage by its volumes until the braking time; depends only on the occupancy
     programme: PlacedProgramme
     ready: bool  #: True: the motion exists already
     size: int  #: ticks of a batch
@@ -247,9 +247,9 @@ def _compare_log(
 
 def _full_coverages(
     run_config: RunConfig, variants: Sequence[Variant], people: RecordedPeople, folder: Path
-) -> dict[str, Outcome | None]:
-    """Computes the coverage of the person by the volumes of each occupancy until the braking time."""
-    found: dict[str, Outcome | None] = {}
+) -> dict[str, Coverage]:
+    """Computes the coverage of each person by the volumes of each occupancy until the braking time."""
+    found: dict[str, Coverage] = {}
     for variant in sorted(variants, key=lambda variant: variant.method in UNGUARDED):
         if variant.occupancy not in found:
             mine = variant_run_config(run_config, variant)
@@ -410,16 +410,18 @@ def plan(task: VariantTask, progress: Callable[[int], None] | None = None) -> tu
     robot = assembly.robot(run_config, task.programme.T_world_base)
     states, writer = task.folder / "state.parquet", _TablesOf(task.folder)
     surroundings = assembly.surroundings(run_config, robot)
-    done, planner = 0, None if task.ready else _planner(task, robot)
+    done, most, planner = 0, 1, None if task.ready else _planner(task, robot)
     for batch in read_states(states, task.size):
         if planner is not None:
             forecast = Forecast(surroundings, batch)
-            around = [forecast.predict(tick) for tick in range(len(batch))]
-            made = planner.follow(batch.t_ns, around, surroundings.names)
+            t_ns, most = forecast.t_ns, max(most, int(batch.numbers.max()))
+            around = [forecast.predict(tick) for tick in range(len(t_ns))]
+            made = planner.follow(t_ns, around, surroundings.names_of(most))
             writer.table(f"motion_{slug}", motion_columns(made) | stages.nearest_columns(planner, made))
-        done += len(batch)
+        count = len(batch.ticks()[0])
+        done += count
         if progress is not None:
-            progress(len(batch))
+            progress(count)
     writer.close_tables()
     motion = pq.read_table(task.folder / f"motion_{slug}.parquet").to_pandas()
     predicted = Predicted(surroundings.prediction, states)

@@ -65,6 +65,7 @@ class Record:
         )
         self._status = self.motion["status"].astype(str).to_numpy()
         self.states = HumanStates.join(list(read_states(self.folder / "state.parquet", 4096)))
+        _, self._first = self.states.ticks()
         plan = self.run_config.settings.plan.model_copy(update={"method": self.method, "baselines": ()})
         self.run_config = replace(self.run_config, settings=self.run_config.settings.model_copy(update={"plan": plan}))
 
@@ -83,7 +84,16 @@ class Record:
 
     def predict(self, tick: int) -> Predict:
         """Predicts the obstacles at a tick."""
-        return Forecast(self.surroundings, self.states.rows(slice(tick, tick + 1))).predict(0)
+        return Forecast(self.surroundings, self.people(tick)).predict(0)
+
+    def people(self, tick: int) -> HumanStates:
+        """The fused people at a tick, one row each."""
+        return self.states.rows(slice(int(self._first[tick]), int(self._first[tick + 1])))
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of all volumes, in the order of ``MotionRow.limb``."""
+        return self.surroundings.names_of(int(self.states.numbers.max()))
 
     def again(self, tick: int) -> TickContext | None:
         """Computes the tick again; None if no attempt gives the recorded step bit by bit."""
@@ -208,8 +218,9 @@ def facts(record: Record, tick: int) -> dict[str, Any] | None:
     if context is None:
         return None
     robot, settings, row = record.controller.robot, record.controller.settings, record.motion.iloc[tick]
-    links, all_names = [segment.name for segment in robot.segments], record.surroundings.names
-    limbs = all_names[context.seen.obstacles.first :]  # names of the hulls of this tick
+    links, obstacles = [segment.name for segment in robot.segments], context.seen.obstacles
+    limbs = [record.names[obstacles.index(k)] for k in range(len(obstacles.radius_m))]  # of the hulls of this tick
+    people = record.people(tick)
     found: dict[str, Any] = {
         "at_s": float(row["t_ns"] - record.motion["t_ns"].iloc[0]) * 1e-9,
         "tick": tick,
@@ -223,16 +234,15 @@ def facts(record: Record, tick: int) -> dict[str, Any] | None:
     }
     sight = context.seen.sight
     if sight.limb >= 0:
-        found["nearest"] = {"link": links[sight.link], "limb": all_names[sight.limb]}
+        found["nearest"] = {"link": links[sight.link], "limb": record.names[sight.limb]}
         found["nearest"] |= {"distance_m": sight.distance_m, "overlap_m": sight.overlap_m}
-        found["unseen_s"] = _unseen(record, tick, all_names[sight.limb])
-    if record.states.nobody_s is not None:
+        found["unseen_s"] = _unseen(people, record.names[sight.limb])
+    if people.person is not None:
+        found["people"] = [_described(people, row, record.surroundings.fresh_s) for row in range(len(people))]
+    if people.nobody_s is not None:
         found["watched"] = {
-            name: float(since[tick]) if since is not None and np.isfinite(since[tick]) else None
-            for name, since in (
-                ("nobody_s", record.states.nobody_s),
-                ("nobody_else_s", record.states.nobody_else_s),
-            )
+            name: float(since.max()) if since is not None and np.isfinite(since).all() else None
+            for name, since in (("nobody_s", people.nobody_s), ("nobody_else_s", people.nobody_else_s))
         }
     if record.method == "none" or standstill_reason(sight, settings):
         return found
@@ -262,25 +272,43 @@ def _objects(record: Record, tick: int) -> dict[str, Any]:
 
 def _cameras(record: Record, tick: int) -> dict[str, dict[str, float | None]]:
     """Camera -> time since its frames last entered the fused person, and the age of its newest frame then [s]."""
-    t_ns = int(record.states.t_ns[tick])
+    states, (ticks_ns, first) = record.states, record.states.ticks()
+    t_ns = int(ticks_ns[tick])
     path = record.folder / "measurements.parquet"
     frames = pq.read_table(path, columns=["camera", "capture_ns", "arrival_ns"]).to_pandas() if path.exists() else None
     found = {}
-    for i, camera in enumerate(record.states.cameras):
-        used = np.flatnonzero(record.states.valid[: tick + 1, i])
+    for i, camera in enumerate(states.cameras):
+        used = np.flatnonzero(states.valid[: first[tick + 1], i])
         newest = None
         if frames is not None:
             arrived = frames[(frames["camera"] == camera) & (frames["arrival_ns"] <= t_ns)]
             newest = None if arrived.empty else (t_ns - int(arrived["capture_ns"].max())) * 1e-9
-        ago = None if not len(used) else (t_ns - int(record.states.t_ns[used[-1]])) * 1e-9
+        ago = None if not len(used) else (t_ns - int(states.t_ns[used[-1]])) * 1e-9
         found[camera] = {"used_s_ago": ago, "newest_frame_s_ago": newest}
     return found
 
 
-def _unseen(record: Record, tick: int, limb: str) -> float | None:
-    """Time since a camera last saw the joints of a limb [s]; None for the lower body and for a limb not seen before."""
-    since = record.states.unseen_s[tick, LIMBS.index(limb)] if limb in LIMBS else np.inf
-    return float(since) if np.isfinite(since) else None
+def _unseen(people: HumanStates, name: str) -> float | None:
+    """Time since a camera last saw the joints of a limb [s]; None for the lower body and for a limb not seen before.
+
+    Args:
+        people: The fused people at the tick.
+        name: Name of the limb's volume.
+    """
+    for row, number in enumerate(people.numbers.tolist()):
+        for k, limb in enumerate(LIMBS):
+            since = people.unseen_s[row, k]
+            if name == assembly.of_person(limb, number) and np.isfinite(since):
+                return float(since)
+    return None
+
+
+def _described(people: HumanStates, row: int, fresh_s: float) -> dict[str, Any]:
+    """The facts about one of several people at a tick: number, state, and age of the newest frame [s]."""
+    age_s = float(people.frame_age_s[row])
+    fused = "known" if age_s <= fresh_s else "unknown, as no camera shows this person"
+    state = fused if np.isfinite(people.p[row, 0]) else "only just seen: counts by the points alone"
+    return {"person": int(people.numbers[row]), "state": state, "frame_age_s": age_s if np.isfinite(age_s) else None}
 
 
 def _named(found: dict[str, Any], links: Sequence[str], limbs: Sequence[str]) -> dict[str, Any]:
@@ -334,6 +362,9 @@ def sentences(found: Mapping[str, Any]) -> list[str]:
         lines.append(f"The {stop} stop proposed, {1e3 * one['stop_s']:.0f} ms long: {_failure(one)}.")
     if found.get("unseen_s") is not None:
         lines.append(f"That limb was last seen {1e3 * found['unseen_s']:.0f} ms before.")
+    for one in found.get("people", ()):
+        aged = "" if one["frame_age_s"] is None else f", newest frame {1e3 * one['frame_age_s']:.0f} ms old"
+        lines.append(f"Person {one['person']}: {one['state']}{aged}.")
     if "watched" in found:
         lines += [_watched_text(found["watched"])]
     for camera, ages in found["cameras"].items():

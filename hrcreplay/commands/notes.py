@@ -12,6 +12,7 @@ import pyarrow.parquet as pq
 from hrcreplay.reporting import tables, verdict
 from hrcreplay.reporting.metrics import fusion as fusion_metrics
 from hrcreplay.robot.model import RobotModel
+from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import Run
 
 _FIRST_S = 1.0  # with a person; earlier the volumes are large, as little is known yet
@@ -44,11 +45,13 @@ def _unmeasured(folder: Path, meta: dict[str, Any], told: list[str]) -> list[str
 
     def table(name: str) -> Any:
         path = folder / f"{name}.parquet"
-        return (
-            pq.read_table(path, columns=list(fusion_metrics.LIMB_COLUMNS[name])).to_pandas() if path.exists() else None
-        )
+        if not path.exists():
+            return None
+        optional = [column for column in run_folder.OPTIONAL if column in pq.read_schema(path).names]
+        return pq.read_table(path, columns=[*optional, *fusion_metrics.LIMB_COLUMNS[name]]).to_pandas()
 
-    return verdict.limb_remarks(Run(folder, meta, state=table("state"), measurements=table("measurements")), told)
+    run = Run(folder, meta, state=table("state"), measurements=table("measurements"))
+    return verdict.limb_remarks(run.of_person(1), told)
 
 
 def _overlaps(folder: Path, motions: Mapping[str, Path], rate_hz: float) -> list[str]:
@@ -69,7 +72,8 @@ def initial_overlap(state: Path, motion: Path, rate_hz: float) -> str | None:
         motion: Table of the robot's motion, at the same ticks.
         rate_hz: Ticks a second [Hz].
     """
-    person = pq.read_table(state, columns=["x"])["x"].to_numpy()
+    people = pq.read_table(state, columns=["t_ns", "x"]).to_pandas()
+    person = people.groupby("t_ns", sort=True)["x"].first().to_numpy()  # the first known one of each tick
     table = pq.read_table(motion, columns=["distance_m", "link", "limb"])
     distance_m, links, limbs = (table[name].to_pylist() for name in ("distance_m", "link", "limb"))
     near = [i for i in np.flatnonzero(np.isfinite(person)).tolist() if limbs[i] is not None]

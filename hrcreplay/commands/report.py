@@ -5,8 +5,11 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import pandas as pd
 
 from hrcreplay.commands.explain import Record, stop_table
 from hrcreplay.errors import SettingsError
@@ -20,6 +23,7 @@ from hrcreplay.reporting.figures.catalogue import FigureData, FigureKind
 from hrcreplay.reporting.figures.figure_data import compute_fields
 from hrcreplay.reporting.metrics.contact import add_contact
 from hrcreplay.reporting.metrics.fusion import add_fusion, add_limbs, add_occupancy, add_quality
+from hrcreplay.reporting.metrics.people import add_people
 from hrcreplay.reporting.metrics.planning import add_plan
 from hrcreplay.reporting.metrics.series import Metric, MetricTable, start_ns
 from hrcreplay.reporting.page import report_page
@@ -43,8 +47,9 @@ def write_report(run_config: RunConfig, writer: RunWriter, meta: dict[str, Any],
         log: Log of a replay, whose ticks can be computed again; None for a live session.
     """
     near = _bounds(run_config.settings.model_dump())
-    run = run_folder.read(writer.partial, meta, shown=True)
-    found = compute(run, **near)
+    everybody = run_folder.read(writer.partial, meta, shown=True)
+    found = compute(everybody, **near)
+    run = everybody.of_person(everybody.people[0])
     stops = _stops(run_config, log, run, near["stationary_m_per_s"], found) if log else ()
     writer.text("metrics.json", run_folder.to_json(found))
     prediction_stage = assembly.prediction_stage(run_config)
@@ -60,7 +65,7 @@ def write_report(run_config: RunConfig, writer: RunWriter, meta: dict[str, Any],
         tables.limit_table(run_config.tracking_limits, use="tracking"),
         tables.radius_table(radii),
     ]
-    scene = scene_of(run_config, run)
+    scene = scene_of(run_config, everybody)
     writer.text("report.html", report_page.render(run, found, folder, shown, stops=stops, scene=scene))
     if scene is not None:
         write_scene(writer.partial / "scene.mcap", scene, run.measurements)
@@ -73,7 +78,16 @@ def scene_of(run_config: RunConfig, run: Run) -> ReplayScene | None:
     radii_m = part_radii(run_config.settings.prediction, run_config.settings.report.leg_radius_m)
     parts = dict(zip(PARTS, radii_m.tolist(), strict=True))
     robot = assembly.robot(run_config, run.T_world_base)
-    return replay_scene(run, robot, start_ns(run), parts, assembly.bounded_hulls(run_config, robot))
+    one = run.of_person(run.people[0])
+    if run.occupancy is not None and "person" in run.occupancy:
+        one = replace(one, occupancy=_named_volumes(run.occupancy))
+    return replay_scene(one, robot, start_ns(one), parts, assembly.bounded_hulls(run_config, robot))
+
+
+def _named_volumes(occupancy: pd.DataFrame) -> pd.DataFrame:
+    """The volumes of all people, each limb named with its person."""
+    pairs = zip(occupancy["limb"].astype(str), occupancy["person"].tolist(), strict=True)
+    return occupancy.assign(limb=[assembly.of_person(limb, number) for limb, number in pairs])
 
 
 def _stops(
@@ -107,7 +121,7 @@ def _stops(
 def summary(folder: Path) -> list[str]:
     """Returns the main figures of a run, one line per stage."""
     run = run_folder.read(folder)
-    return lines(run, compute(run, **_bounds(run.meta["settings"])))
+    return lines(run.of_person(run.people[0]), compute(run, **_bounds(run.meta["settings"])))
 
 
 def _bounds(settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -133,6 +147,8 @@ def compute(run: Run, *, near_m: float, stationary_m_per_s: float, gap_s: float 
     """
     recorded = run.meta.get("settings", {})
     metrics = MetricTable()
+    add_people(metrics, run)
+    run = run.of_person(run.people[0])
     add_quality(metrics, run, gap_s)
     add_limbs(metrics, run)
     add_occupancy(metrics, run.occupancy)
@@ -259,4 +275,5 @@ def _recorded(folder: Path, option: str) -> tuple[Run, dict[str, Metric]]:
     if "settings" not in run.meta or "fusion" not in run.meta["settings"]:
         raise SettingsError(f"{option}: {folder} is no run of fuse, predict, plan, report or live")
     path = folder / "metrics.json"
-    return run, json.loads(path.read_text()) if path.exists() else compute(run, **_bounds(run.meta["settings"]))
+    metrics = json.loads(path.read_text()) if path.exists() else compute(run, **_bounds(run.meta["settings"]))
+    return run.of_person(run.people[0]), metrics

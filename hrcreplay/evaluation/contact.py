@@ -9,7 +9,7 @@ controller, else with the prediction.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -30,7 +30,7 @@ from hrcreplay.pipeline.run_config import RunConfig
 from hrcreplay.records import BODY, RECORDED, UNGUARDED, Bools, Floats, HumanStates, Ints, SweptVolume
 from hrcreplay.robot.model import LinkMotion, RobotModel
 from hrcreplay.robot.recorded import CapsuleSample, RecordedCapsules
-from hrcreplay.store.columns import Columns, body_columns, contact_columns, read_states, state_columns
+from hrcreplay.store.columns import Columns, body_columns, contact_columns, person_columns, read_states, state_columns
 from hrcreplay.store.run_folder import RunWriter
 
 _BATCH = 4096
@@ -57,7 +57,8 @@ def read_recorded_people(run_config: RunConfig, log: Log, writer: RunWriter) -> 
         log: Log of the run.
         writer: Run folder with complete tables.
     """
-    ticks_ns = np.concatenate([states.t_ns for states in read_states(writer.partial / "state.parquet", _BATCH)])
+    parts = read_states(writer.partial / "state.parquet", _BATCH)
+    ticks_ns = np.concatenate([states.ticks()[0] for states in parts])
     fusion_stage = assembly.fusion_stage(run_config, log)
     path = writer.partial / "smooth.parquet"
 
@@ -72,10 +73,10 @@ def read_recorded_people(run_config: RunConfig, log: Log, writer: RunWriter) -> 
 
 
 def _smooth(run_config: RunConfig, log: Log, ticks_ns: Ints) -> Iterator[HumanStates]:
-    """Fuses and smooths the person, if the stage was not run or was reused."""
+    """Fuses and smooths the people, if the stage was not run or was reused."""
     fusion_stage, cameras = assembly.fusion_stage(run_config, log), log.header.cameras
     fuser = PersonFuser(replace(fusion_stage, watched=None), cameras, traced=True)
-    smoother = stages.StretchSmoother(fusion_stage.filter)
+    smoother = stages.PeopleSmoother(fusion_stage.filter)
     for ticks, seen in stages.batches(log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1), ticks_ns, _BATCH):
         fused, _ = fuser.update(ticks, seen)
         yield from smoother.add(fused.states, fused.trace)
@@ -105,7 +106,7 @@ def write_contact(run_config: RunConfig, log: Log, writer: RunWriter, T_world_ba
                 compute_full_coverage(run_config, people, predicted),
             )
             shown_ns = motion["t_ns"].to_numpy()[:: max(1, round(run_config.settings.fusion.rate_hz / _BODY_HZ))]
-            axes_m = body_axes(people.person, shown_ns, run_config.settings.prediction.hand_m)
+            axes_m = body_axes(people.people[0].tracks, shown_ns, run_config.settings.prediction.hand_m)
             writer.table("body", body_columns(shown_ns, axes_m, PARTS))
         capsules = None
         if method == RECORDED and motion["q1"].isna().all():
@@ -123,9 +124,13 @@ def body_axes(person: Sequence[BodyTrack], at_ns: Ints, hand_m: float) -> Floats
     return axes_m
 
 
+#: Coverage of each person; None if not computed.
+Coverage = Sequence[Outcome | None]
+
+
 def compute_own_coverage(
     run_config: RunConfig, people: RecordedPeople, predicted: Predicted, motion: pd.DataFrame
-) -> Outcome | None:
+) -> Coverage:
     """Coverage of every checked tick until the horizon of the volumes that the controller used.
 
     Args:
@@ -134,20 +139,30 @@ def compute_own_coverage(
         predicted: Volumes of any tick.
         motion: Rows of a motion table.
     """
-    if run_config.settings.plan.method in UNGUARDED:
-        return None
-    states = predicted.all_states
-    horizon_s = _at(states.t_ns, motion["t_ns"].to_numpy(), motion["horizon_s"].to_numpy(dtype=float))
-    return coverage(predicted.stage, people, states, run_config.settings.fusion, horizon_s)
+    used = motion["t_ns"].to_numpy(), motion["horizon_s"].to_numpy(dtype=float)
+    return _coverage(run_config, people, predicted, lambda states: _at(states.t_ns, *used))
 
 
-def compute_full_coverage(run_config: RunConfig, people: RecordedPeople, predicted: Predicted) -> Outcome | None:
+def compute_full_coverage(run_config: RunConfig, people: RecordedPeople, predicted: Predicted) -> Coverage:
     """Coverage of every checked tick until the braking time T_s, as ``audit`` counts it."""
+    stop_s = predicted.stage.horizon_s
+    return _coverage(run_config, people, predicted, lambda states: np.full(len(states), stop_s))
+
+
+def _coverage(
+    run_config: RunConfig,
+    people: RecordedPeople,
+    predicted: Predicted,
+    horizons_s: Callable[[HumanStates], Floats],
+) -> Coverage:
+    """Coverage of each person."""
     if run_config.settings.plan.method in UNGUARDED:
-        return None
-    states = predicted.all_states
-    horizon_s = np.full(len(states), predicted.stage.horizon_s)
-    return coverage(predicted.stage, people, states, run_config.settings.fusion, horizon_s)
+        return [None] * len(people.people)
+    found, fusion = [], run_config.settings.fusion
+    for person in people.people:
+        states = predicted.all_states.of_person(person.number)
+        found.append(coverage(predicted.stage, person, states, fusion, horizons_s(states)))
+    return found
 
 
 def contact_table(
@@ -157,8 +172,8 @@ def contact_table(
     motion: pd.DataFrame,
     people: RecordedPeople,
     predicted: Predicted,
-    own: Outcome | None,
-    full: Outcome | None,
+    own: Coverage | None,
+    full: Coverage | None,
     capsules: RecordedCapsules | None = None,
 ) -> Columns:
     """Computes the rows of contact.parquet for one motion.
@@ -176,20 +191,27 @@ def contact_table(
     """
     prediction, t_ns = run_config.settings.prediction, motion["t_ns"].to_numpy()
     radii_m = part_radii(prediction, run_config.settings.report.leg_radius_m)
-    groups, moving = (people.person, people.others), _is_turning(motion)
+    groups, moving = [*(one.tracks for one in people.people), people.others], _is_turning(motion)
     links = tuple(segment.name for segment in robot.segments)
     if capsules is None:
-        person, other = nearest(robot, motion, groups, radii_m, prediction.hand_m)
+        *each, other = nearest(robot, motion, groups, radii_m, prediction.hand_m)
     else:
         sample, links = capsules.sample(t_ns), capsules.names
         moving = np.asarray(np.nan_to_num(sample.velocity).any(axis=(1, 2, 3)))
-        person, other = (nearest_capsule(sample, t_ns, tracks, radii_m, prediction.hand_m) for tracks in groups)
+        *each, other = (nearest_capsule(sample, t_ns, tracks, radii_m, prediction.hand_m) for tracks in groups)
+    person = _nearest_person(each, people)
     worst, of_other = choose_nearer(person, other)
     outside_m = np.full(len(t_ns), np.nan)
     if method not in UNGUARDED:
-        outside_m = by_volume(motion, person, people.person, radii_m, prediction.hand_m, predicted)
+        outside_m = by_volume(motion, person, people, radii_m, prediction.hand_m, predicted)
     sources = tuple(track.source for track in people.tracks)
-    return contact_columns(
+    if len(each) > 1:
+        named = [f"person {one.number}, {track.source}" for one in people.people for track in one.tracks]
+        sources = (*named, *sources[len(named) :])
+    nobody: Coverage = [None] * len(each)
+    pairs = zip(own or nobody, full or nobody, strict=True)
+    of_each = [(_measure_left(a, t_ns), _measure_left(b, t_ns)) for a, b in pairs]
+    columns = contact_columns(
         t_ns=t_ns,
         method=method,
         person=people.source,
@@ -201,9 +223,31 @@ def contact_table(
         source=(np.where(of_other, len(people.person) + worst.track, worst.track), sources),
         apart=(person.distance_m, other.distance_m),
         outside_m=outside_m,
-        left=(*_measure_left(own, t_ns), BODY),
-        left_full=(*_measure_left(full, t_ns), BODY),
+        left=(*_worst_left([a for a, _ in of_each]), BODY),
+        left_full=(*_worst_left([b for _, b in of_each]), BODY),
     )
+    if len(each) > 1:
+        for one, pair, (a, b) in zip(people.people, each, of_each, strict=True):
+            columns |= person_columns(one.number, pair.distance_m, a[0], b[0])
+    return columns
+
+
+def _nearest_person(each: Sequence[Nearest], people: RecordedPeople) -> Nearest:
+    """The nearest of all people, its track counted among those of all of them."""
+    found, first = each[0], len(people.people[0].tracks)
+    for pair, one in zip(each[1:], people.people[1:], strict=True):
+        found, _ = choose_nearer(found, replace(pair, track=np.where(pair.track >= 0, pair.track + first, -1)))
+        first += len(one.tracks)
+    return found
+
+
+def _worst_left(each: Sequence[tuple[Floats, Ints]]) -> tuple[Floats, Ints]:
+    """The person furthest outside its volumes, tick by tick."""
+    out_m, limb = each[0]
+    for other_m, other_limb in each[1:]:
+        worse = ~(out_m >= other_m) & np.isfinite(other_m)
+        out_m, limb = np.where(worse, other_m, out_m), np.where(worse, other_limb, limb)
+    return out_m, limb
 
 
 @dataclass(frozen=True)
@@ -340,19 +384,20 @@ class Predicted:
         """Reads the fused person at every tick."""
         return HumanStates.join(list(read_states(self.states, _BATCH)))
 
-    def volumes(self, t_ns: int, horizon_s: float) -> Volumes:
-        """Volumes of the last state that is not later than ``t_ns``; none if the person was unknown."""
-        row = int(np.searchsorted(self.all_states.t_ns, t_ns, side="right")) - 1
+    def volumes(self, t_ns: int, horizon_s: float, person: int = 1) -> Volumes:
+        """Volumes of a person's last state that is not later than ``t_ns``; none if the person was unknown."""
+        states = self.all_states.of_person(person)
+        row = int(np.searchsorted(states.t_ns, t_ns, side="right")) - 1
         if row < 0:
             return {}
-        volumes = self.stage.volumes(self.all_states.rows(slice(row, row + 1)), horizon_s)
+        volumes = self.stage.volumes(states.rows(slice(row, row + 1)), horizon_s)
         return {limb: volume for limb, volume in volumes.at(0).items() if volume.known}
 
 
 def by_volume(
     motion: pd.DataFrame,
     found: Nearest,
-    tracks: Sequence[BodyTrack],
+    people: RecordedPeople,
     radii_m: Floats,
     hand_m: float,
     predicted: Predicted,
@@ -364,23 +409,23 @@ def by_volume(
 
     Args:
         motion: Rows of a motion table.
-        found: Nearest pair with the person's tracks at the same ticks.
-        tracks: Tracks of the person.
+        found: Nearest pair with the tracks of all people at the same ticks.
+        people: Recorded people.
         radii_m: (14,) radii of PARTS [m].
         hand_m: Length of a hand beyond the wrist [m].
         predicted: Volumes of any tick.
     """
-    outside_m = np.full(len(motion), np.nan)
+    outside_m, tracks, numbers = np.full(len(motion), np.nan), people.person, people.numbers
     t_ns, horizon_s = motion["t_ns"].to_numpy(), motion["horizon_s"].to_numpy(dtype=float)
     decided = deciding_rows(motion)
     volumes: Volumes = {}
-    last = -1
+    last = (-1, 0)
     for i in np.flatnonzero(_is_turning(motion) & (found.distance_m <= 0.0)).tolist():
-        k = int(decided[i])
+        k, person = int(decided[i]), int(numbers[found.track[i]])
         if k < 0:
             continue
-        if k != last:
-            volumes, last = predicted.volumes(int(t_ns[k]), float(horizon_s[k])), k
+        if (k, person) != last:
+            volumes, last = predicted.volumes(int(t_ns[k]), float(horizon_s[k]), person), (k, person)
         part = int(found.part[i])
         solid = volumes.get(VOLUME_OF[PARTS[part]])
         if solid is not None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hrcreplay.evaluation.recorded_person import LIMB_POINTS, RecordedPeople
+from hrcreplay.evaluation.recorded_person import LIMB_POINTS, RecordedPerson
 from hrcreplay.geometry.inflated_hull import InflatedHull, union_volume_m3
 from hrcreplay.human.prediction.sound_reach import THIGH_M
 from hrcreplay.human.prediction.swept_volumes import limb_radii
@@ -201,22 +201,22 @@ def select_rows(states: HumanStates, last_ns: int, rate_hz: float, horizon_s: fl
 
 
 def coverage(
-    stage: PredictionStage, people: RecordedPeople, states: HumanStates, fusion: Fusion, horizon_s: Floats
+    stage: PredictionStage, person: RecordedPerson, states: HumanStates, fusion: Fusion, horizon_s: Floats
 ) -> Outcome | None:
-    """Computes the coverage of the recorded person by a run's volumes at the checked ticks; None without such ticks.
+    """Computes the coverage of a recorded person by a run's volumes at the checked ticks; None without such ticks.
 
     Args:
         stage: Stage 2.
-        people: Recorded people.
-        states: (n,) every tick of the run.
+        person: The recorded person.
+        states: (n,) the person at every tick.
         fusion: Settings of stage 1.
         horizon_s: (n,) horizon of each tick's volumes, without the latency; NaN: tick not checked [s].
     """
     until_s = horizon_s + stage.settings.latency_s
-    last_ns = int(people.t_ns[-1]) if len(people.t_ns) else 0
+    last_ns = int(person.t_ns[-1]) if len(person.t_ns) else 0
     rows = select_rows(states, last_ns, fusion.rate_hz, np.where(np.isfinite(until_s), until_s, np.inf), fusion.fresh_s)
     asked = states.rows(rows)
-    future = recorded_future(people.t_ns, people.points_m, asked, until_s[rows])
+    future = recorded_future(person.t_ns, person.points_m, asked, until_s[rows])
     radii_m, nothing = body_radii_m(stage), np.zeros(1, dtype=np.bool_)
     outcomes = []
     for i, row in enumerate(rows.tolist()):

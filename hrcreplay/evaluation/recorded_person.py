@@ -1,6 +1,6 @@
 """The people in a recording, from its ground truth or its cameras: the reference for contact and coverage.
 
-The person is the one that the robot plans for. All other people in a frame also count for contact, although there is no
+The robot plans for every person tracked. All other bodies in a frame also count for contact, although there is no
 prediction for them.
 """
 
@@ -15,7 +15,6 @@ import numpy as np
 from hrcreplay.errors import LogError
 from hrcreplay.human.fusion import fuse, inverse_kinematics
 from hrcreplay.human.model import part_axes, skeleton
-from hrcreplay.logs.cleaning import PersonMemory
 from hrcreplay.logs.reader import Log
 from hrcreplay.pipeline.assembly import FusionStage
 from hrcreplay.pipeline.person_fuser import PersonFuser
@@ -110,19 +109,43 @@ class BodyTrack:
 
 
 @dataclass(frozen=True)
-class RecordedPeople:
-    """All people in a log."""
+class RecordedPerson:
+    """One person that the robot plans for, as recorded."""
 
+    number: int  #: from 1
     source: str  #: TRUTH, CAMERAS or SMOOTHED: source of ``points_m``
     t_ns: Ints  #: (m,) instants of the person's recorded points, increasing
     points_m: Floats  #: (m, 20, 3) POINTS of the person, of all cameras in order of time, world [m]; NaN: rejected
-    person: tuple[BodyTrack, ...]  #: only the truth; else the smoothed person and each camera's points
+    tracks: tuple[BodyTrack, ...]  #: only the truth; else the smoothed person and each camera's points
+
+
+@dataclass(frozen=True)
+class RecordedPeople:
+    """All people in a log."""
+
+    people: tuple[RecordedPerson, ...]  #: one or more, in the order of their numbers
     others: tuple[BodyTrack, ...]  #: every other body of every camera
 
     @property
+    def source(self) -> str:
+        """Source of the points: TRUTH if that of any person is."""
+        sources = [one.source for one in self.people]
+        return TRUTH if TRUTH in sources else sources[0]
+
+    @property
+    def person(self) -> tuple[BodyTrack, ...]:
+        """Tracks of all people that the robot plans for."""
+        return tuple(track for one in self.people for track in one.tracks)
+
+    @property
     def tracks(self) -> tuple[BodyTrack, ...]:
-        """Tracks of the person, then those of all others."""
+        """Tracks of these people, then those of all others."""
         return (*self.person, *self.others)
+
+    @property
+    def numbers(self) -> Ints:
+        """(k,) number of the person of each track of ``person``."""
+        return np.array([one.number for one in self.people for _ in one.tracks], dtype=np.int64)
 
 
 def at_instants(t_ns: Ints, points_m: Floats, at_ns: Ints, gap_s: float, hold_s: float = 0.0) -> Floats:
@@ -184,34 +207,96 @@ def read_people(
         log: Log to read.
         ticks_ns: (n,) ticks of the span, increasing [ns].
         fusion_stage: Cameras, and settings of stage 1.
-        smoothed_states: Returns the smoothed states of these ticks; called if the log has no ground truth.
+        smoothed_states: Returns the smoothed states of these ticks; called for people without ground truth.
     """
-    memory, seen, others = PersonMemory(), [], []
-    frames = log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1)
-    for _, due in batches(frames, ticks_ns, _BATCH):
-        if due is not None:
-            memory, found = fusion_stage.measure(due, memory)
-            seen.append(found.measured)
-            others.append(found.everybody.rows(~found.mine))
+    fuser, parts, bodies = PersonFuser(replace(fusion_stage, watched=None), log.header.cameras), [], []
+    for ticks, due in batches(log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1), ticks_ns, _BATCH):
+        if due is None and fusion_stage.people == "nearest":
+            continue
+        _, found = fuser.update(ticks, due)
+        parts.append(found.measured)
+        bodies.append(found.others)
+    seen = Measurements.join(parts) if parts else None
+    others = CameraFrames.join(bodies) if bodies else None
     truth = _truth(log, ticks_ns)
+    of_truth = 1 if truth is None or seen is None else _nearest_to(truth, seen)
+    people = []
     if truth is not None:
-        tracks = _people_off(truth, seen, others, fusion_stage)
-        return RecordedPeople(TRUTH, truth.t_ns, truth.points_m, (truth,), tracks)
-    best = smoothed_states()
-    tracks = tuple(_tracks_of(CameraFrames.join(others), fusion_stage)) if others else ()
+        people.append(RecordedPerson(of_truth, TRUTH, truth.t_ns, truth.points_m, (truth,)))
+    rest = [number for number in _numbers(seen) if truth is None or number != of_truth]
+    best = smoothed_states() if rest else None
+    for number in rest:
+        own = best.of_person(number) if best is not None else None
+        mine = None if seen is None else _rows_of(seen, number)
+        if own is not None and mine is not None and number > 1:  # bodies that were not yet a person
+            known = np.isfinite(own.p[:, 0])
+            since_ns = int(own.t_ns[known][0]) if known.any() else 2**62
+            early = mine.capture_ns < since_ns
+            others = CameraFrames.join([*([] if others is None else [others]), _as_frames(mine.rows(early), number)])
+            mine = mine.rows(~early)
+            if not known.any():
+                continue
+        if own is not None:
+            people.append(_recorded_person(number, mine, own, fusion_stage))
+    if truth is not None:
+        chosen = [] if seen is None else [_as_frames(_rows_of(seen, of_truth), _CHOSEN)]
+        tracks = _people_off(truth, [*chosen, *([] if others is None else [others])], fusion_stage)
+    else:
+        tracks = tuple(_tracks_of(others, fusion_stage)) if others is not None else ()
+    return RecordedPeople(tuple(sorted(people, key=lambda one: one.number)), tracks)
+
+
+def _numbers(seen: Measurements | None) -> list[int]:
+    return sorted({1, *seen.numbers.tolist()}) if seen is not None else [1]
+
+
+def _rows_of(seen: Measurements, number: int) -> Measurements:
+    return replace(seen.rows(seen.numbers == number), person=None)
+
+
+def _nearest_to(truth: BodyTrack, seen: Measurements) -> int:
+    """Number of the person whom the ground truth shows: the nearest to it in the median."""
+    there = at_instants(truth.t_ns, truth.points_m, seen.capture_ns, GAP_S)
+    off = np.linalg.norm(seen.points_m - there, axis=2)
+    known = np.isfinite(off)
+    apart_m = np.where(known, off, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
+    found = {
+        number: float(np.median(apart_m[rows]))
+        for number in _numbers(seen)
+        if (rows := (seen.numbers == number) & known.any(axis=1)).any()
+    }
+    return min(found, key=lambda number: (found[number], number), default=1)
+
+
+def _recorded_person(
+    number: int, seen: Measurements | None, best: HumanStates, fusion_stage: FusionStage
+) -> RecordedPerson:
+    """A person without ground truth: the smoothed states and the believed points of each camera."""
     smoothed = from_states(best, fusion_stage.filter.memory_s)
-    if not seen:
-        return RecordedPeople(SMOOTHED, smoothed.t_ns, smoothed.points_m, (smoothed,), tracks)
-    measurements = Measurements.join(seen)
-    points, _ = _select_accepted(measurements, best, fusion_stage)
-    source, t_ns, points_m = _recorded_points(measurements, points, best)
+    if seen is None or not len(seen):
+        return RecordedPerson(number, SMOOTHED, smoothed.t_ns, smoothed.points_m, (smoothed,))
+    points, _ = _select_accepted(seen, best, fusion_stage)
+    source, t_ns, points_m = _recorded_points(seen, points, best)
     cameras = [
-        _track(camera, measurements.capture_ns[mine], points[mine])
-        for c, camera in enumerate(measurements.cameras)
-        for mine in [measurements.camera == c]
+        _track(camera, seen.capture_ns[mine], points[mine])
+        for c, camera in enumerate(seen.cameras)
+        for mine in [seen.camera == c]
         if np.isfinite(points[mine]).any()
     ]
-    return RecordedPeople(source, t_ns, points_m, (smoothed, *cameras), tracks)
+    return RecordedPerson(number, source, t_ns, points_m, (smoothed, *cameras))
+
+
+def _as_frames(seen: Measurements, body: int) -> CameraFrames:
+    """Measurements as frames with their points in the world and a body id."""
+    return CameraFrames(
+        seen.capture_ns,
+        seen.arrival_ns,
+        seen.camera,
+        np.full(len(seen), body),
+        seen.points_m,
+        seen.confidence,
+        seen.cameras,
+    )
 
 
 def _truth(log: Log, ticks_ns: Ints) -> BodyTrack | None:
@@ -247,22 +332,8 @@ def _tracks_of(bodies: CameraFrames, fusion_stage: FusionStage) -> Iterator[Body
         yield _track(f"{bodies.cameras[camera]}, body {body}", bodies.capture_ns[mine], points_m[mine])
 
 
-def _people_off(
-    truth: BodyTrack, seen: Sequence[Measurements], others: Sequence[CameraFrames], fusion_stage: FusionStage
-) -> tuple[BodyTrack, ...]:
-    """Makes the tracks of all bodies away from the ground truth, selected as the person or not."""
-    tables = []
-    for measured, rest in zip(seen, others, strict=True):
-        chosen = CameraFrames(
-            measured.capture_ns,
-            measured.arrival_ns,
-            measured.camera,
-            np.full(len(measured), _CHOSEN),
-            measured.points_m,
-            measured.confidence,
-            measured.cameras,
-        )
-        tables += [chosen, rest]
+def _people_off(truth: BodyTrack, tables: Sequence[CameraFrames], fusion_stage: FusionStage) -> tuple[BodyTrack, ...]:
+    """Makes the tracks of all bodies away from the ground truth, selected as its person or not."""
     if not tables:
         return ()
     bodies = CameraFrames.join(tables)
@@ -343,7 +414,8 @@ def fuse_stretches(
     Raises:
         LogError: No camera saw a person.
     """
-    fuser, ever = PersonFuser(replace(fusion_stage, watched=None), log.header.cameras, traced=True), False
+    fusion_stage = replace(fusion_stage, watched=None, people="nearest")
+    fuser, ever = PersonFuser(fusion_stage, log.header.cameras, traced=True), False
     for ticks, due in batches(log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1), ticks_ns, _BATCH):
         progress(len(ticks))
         ever = ever or due is not None

@@ -46,7 +46,7 @@ from hrcreplay.robot.control.control_step import PlanSettings
 from hrcreplay.robot.control.controllers import CONTROLLERS, Controller, Planner, Predict
 from hrcreplay.robot.control.programme_check import check_programme
 from hrcreplay.robot.control.recorded import RecordedCapsuleMotion, RecordedMotion
-from hrcreplay.robot.control.separation import Obstacles, obstacles
+from hrcreplay.robot.control.separation import Obstacles, join_obstacles, obstacles
 from hrcreplay.robot.control.static_obstacles import StaticHull, StaticObstacles, half_space
 from hrcreplay.robot.model import RobotModel, Segment, from_urdf, irb140
 from hrcreplay.robot.path import check_recorded, plan_programme, recorded_remarks, smooth_recorded
@@ -58,10 +58,20 @@ from hrcreplay.settings.sections import Fusion, Prediction, Robot
 class Sightings(NamedTuple):
     """Content of some frames."""
 
-    measured: Measurements  #: measurements of the person
+    measured: Measurements  #: measurements of the people; of all bodies until they are assigned to people
     everybody: CameraFrames  #: all bodies, and frames without a body; points in the world [m]
-    mine: Bools  #: rows of ``everybody`` that are the person
+    person: Ints  #: (n,) number of each body's person; 0: nobody, or not assigned yet; negative: shown twice
     counts: Counter[str]  #: counts of ``select_person``, and ``frames_late_<camera>``
+
+    @property
+    def mine(self) -> Bools:
+        """Rows of ``everybody`` that show a person."""
+        return np.asarray(self.person > 0)
+
+    @property
+    def others(self) -> CameraFrames:
+        """Bodies that are none of the people."""
+        return self.everybody.rows((self.person == 0) & (self.everybody.body != NOBODY))
 
 
 @dataclass(frozen=True)
@@ -74,7 +84,15 @@ class FusionStage:
     limits: LimitSet
     person_jump_m: float
     person_memory_s: float
+    people: str  #: of ``logs.people``
     watched: WatchedArea | None = None  #: area in which every person is seen by a camera
+
+    def measure_all(self, frames: CameraFrames) -> Sightings:
+        """Measures all bodies of frames, on the clock of the reference camera; they are not assigned to people yet."""
+        frames, counts = self._current(frames)
+        nobody = np.zeros(len(frames), np.int64)
+        measured = inverse_kinematics.measure(frames.rows(frames.body != NOBODY), self.T_world_camera, self.filter)
+        return Sightings(measured, self._in_world(frames), nobody, counts)
 
     def measure(self, frames: CameraFrames, memory: PersonMemory) -> tuple[PersonMemory, Sightings]:
         """Measures frames on the clock of the reference camera; see ``clean.select_person``.
@@ -82,19 +100,28 @@ class FusionStage:
         A frame that was captured more than ``fresh_s`` before its arrival is outdated: it is dropped and counted as
         ``frames_late_<camera>``.
         """
-        frames = self.on_one_clock(frames)
-        late = np.asarray(frames.arrival_ns - frames.capture_ns > self.filter.fresh_s * 1e9)
+        frames, counts = self._current(frames)
         bodies = frames.body != NOBODY
-        counts = Counter(f"frames_late_{frames.cameras[camera]}" for camera in frames.camera[late & bodies])
-        frames, bodies = frames.rows(~late), bodies[~late]
         mine = np.zeros(len(frames), dtype=np.bool_)
         memory, mine[bodies], found = select_person(
             frames.rows(bodies), memory, self.T_world_camera, self.person_jump_m, self.person_memory_s
         )
         measured = inverse_kinematics.measure(frames.rows(mine), self.T_world_camera, self.filter)
+        return memory, Sightings(measured, self._in_world(frames), mine.astype(np.int64), found + counts)
+
+    def _current(self, frames: CameraFrames) -> tuple[CameraFrames, Counter[str]]:
+        """The frames on the clock of the reference camera, without the outdated ones, and the counts of those."""
+        frames = self.on_one_clock(frames)
+        late = np.asarray(frames.arrival_ns - frames.capture_ns > self.filter.fresh_s * 1e9)
+        bodies = frames.body != NOBODY
+        counts = Counter(f"frames_late_{frames.cameras[camera]}" for camera in frames.camera[late & bodies])
+        return frames.rows(~late), counts
+
+    def _in_world(self, frames: CameraFrames) -> CameraFrames:
+        """The frames with their points in the world."""
         T = self.T_world_camera[frames.camera]
         points_m = np.einsum("nij,npj->npi", T[:, :3, :3], frames.points_m) + T[:, None, :3, 3]
-        return memory, Sightings(measured, replace(frames, points_m=points_m), mine, found + counts)
+        return replace(frames, points_m=points_m)
 
     def on_one_clock(self, frames: CameraFrames) -> CameraFrames:
         """Converts the capture times to the clock of the reference camera, none later than its arrival."""
@@ -171,35 +198,58 @@ class WatchedBorder:
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Obstacles of a robot: the person's volumes, and the border beyond which unseen people may be.
+    """Obstacles of a robot: the people's volumes, and the border beyond which unseen people may be.
 
     A person whose newest frame is too old is unknown. No person is needed while the watched area is certainly empty.
     """
 
     prediction: PredictionStage
-    fresh_s: float  #: maximum age of the person's newest frame, since its capture; an older person is unknown [s]
+    fresh_s: float  #: maximum age of a person's newest frame, since its capture; an older person is unknown [s]
     watched: WatchedBorder | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the obstacles: the limbs that have volumes, then the sides of the border."""
+        """Names of the obstacles beside one person: the limbs that have volumes, then the sides of the border."""
         sides = 0 if self.watched is None else len(self.watched.border.normals)
         return (*self.prediction.limbs, *(BORDER,) * sides)
 
-    def obstacles(self, states: HumanStates, tick: int, person: Obstacles) -> Obstacles:
+    def names_of(self, people: int) -> tuple[str, ...]:
+        """Names of all obstacles beside so many people: ``names``, then the limbs of persons 2, 3, ..."""
+        limbs = self.prediction.limbs
+        return (*self.names, *(of_person(limb, k) for k in range(2, people + 1) for limb in limbs))
+
+    def obstacles(self, states: HumanStates, people: Sequence[Obstacles]) -> Obstacles:
         """Returns the volumes of a tick and the border, as far as they are known.
 
         Args:
-            states: The fused person.
-            tick: Row of ``states``.
-            person: Volumes of that tick.
+            states: The fused people of a tick, one row each.
+            people: Their volumes at that tick.
         """
-        fresh = bool(states.frame_age_s[tick] <= self.fresh_s)
+        fresh = states.frame_age_s <= self.fresh_s
         if self.watched is None or states.nobody_s is None or states.nobody_else_s is None:
-            return person if fresh else replace(person, known=False)
-        since_s = float((states.nobody_else_s if fresh else states.nobody_s)[tick])
-        depth_m = self.watched.depth_m(since_s, person.horizon_s)
-        return self.watched.border.obstacles(depth_m, person.horizon_s, person if fresh else len(person.radius_m))
+            found = join_obstacles(people)
+            return self._numbered(found if fresh.all() else replace(found, known=False), states.numbers)
+        since_s = float(np.where(fresh, states.nobody_else_s, states.nobody_s).max())
+        horizon_s = people[0].horizon_s
+        depth_m = self.watched.depth_m(since_s, horizon_s)
+        known = [one for one, there in zip(people, fresh.tolist(), strict=True) if there]
+        person = join_obstacles(known) if known else len(self.prediction.limbs)
+        return self._numbered(self.watched.border.obstacles(depth_m, horizon_s, person), states.numbers[fresh])
+
+    def _numbered(self, found: Obstacles, people: Ints) -> Obstacles:
+        """The volumes of people (k,) and what follows them, with their places in ``names_of`` if that is needed."""
+        if not (people != 1).any():
+            return found
+        each = len(self.prediction.limbs)
+        first = np.where(people == 1, 0, len(self.names) + (people - 2) * each)
+        limbs = (first[:, None] + np.arange(each)).ravel()
+        rest = each + np.arange(len(found.radius_m) - len(limbs))
+        return replace(found, numbers=np.concatenate([limbs, rest]))
+
+
+def of_person(limb: str, number: int) -> str:
+    """Name of a limb of a person; that of person 1 is the limb's own."""
+    return limb if number == 1 else f"{limb} of person {number}"
 
 
 @dataclass
@@ -209,23 +259,32 @@ class Forecast:
     around: Surroundings
     states: HumanStates
 
+    def __post_init__(self) -> None:
+        self.t_ns, self._first = self.states.ticks()
+
     @cached_property
     def person(self) -> swept_volumes.PreparedPerson:
-        """The person, prepared for volumes at any horizon."""
+        """The people, prepared for volumes at any horizon."""
         return self.around.prediction.predictor.prepare(self.states)
 
     @cached_property
     def full(self) -> SweptVolumes:
-        """Volumes of all ticks for the braking time T_s."""
+        """Volumes of all rows for the braking time T_s."""
         return self.person.volumes(self.around.prediction.horizon_s)
+
+    def rows(self, tick: int) -> slice:
+        """The rows of a tick, one per person."""
+        return slice(int(self._first[tick]), int(self._first[tick + 1]))
 
     def obstacles(self, tick: int, horizon_s: float) -> Obstacles:
         """Obstacles of one tick up to ``horizon_s`` [s]."""
+        rows = self.rows(tick)
         if horizon_s == self.around.prediction.horizon_s:
-            person = obstacles(self.full, tick, horizon_s)
+            people = [obstacles(self.full, row, horizon_s) for row in range(rows.start, rows.stop)]
         else:
-            person = obstacles(self.person.volumes(horizon_s, tick, tick + 1), 0, horizon_s)
-        return self.around.obstacles(self.states, tick, person)
+            volumes = self.person.volumes(horizon_s, rows.start, rows.stop)
+            people = [obstacles(volumes, row, horizon_s) for row in range(len(volumes))]
+        return self.around.obstacles(self.states.rows(rows), people)
 
     def predict(self, tick: int) -> Predict:
         """Obstacles of one tick as a function of the horizon."""
@@ -279,6 +338,7 @@ def fusion_stage(run_config: RunConfig, log: LogLike) -> FusionStage:
         person_jump_m=logs.person_jump_m,
         person_memory_s=logs.person_memory_s,
         watched=watched_area(run_config),
+        people="nearest" if run_config.command == "live" else logs.people,
     )
 
 

@@ -9,7 +9,7 @@ import math
 import sys
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import TracebackType
 from typing import Any, NamedTuple, Protocol, Self
 
@@ -34,6 +34,7 @@ from hrcreplay.records import (
     Floats,
     HumanStates,
     Ints,
+    Measurements,
     Motion,
     SkeletonTrack,
     SweptVolumes,
@@ -48,6 +49,7 @@ from hrcreplay.store.columns import (
     state_columns,
     static_columns,
     truth_columns,
+    with_person,
 )
 from hrcreplay.store.run_folder import Stopwatch
 
@@ -190,22 +192,20 @@ def fuse_batches(
     fuser = PersonFuser(fusion_stage, log.header.cameras, traced=smooth)
     watched = fusion_stage.watched is not None
     frames = log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1, nobody=watched)
-    smoother = StretchSmoother(fusion_stage.filter)
-    checks = CameraChecks(log.header.cameras)
+    smoother = PeopleSmoother(fusion_stage.filter)
+    checks = PeopleChecks(log.header.cameras)
     clocks = ClockCheck(log.header.cameras, fusion_stage.T_world_camera, int(ticks_ns[0]), int(ticks_ns[-1]))
     ever = False
     for ticks, seen in batches(frames, ticks_ns, size):
-        sightings = fuser.nothing
+        with sink.watch.stage("angles", len(ticks)):
+            sightings = fuser.measure(seen)
         if seen is not None:
-            with sink.watch.stage("angles", len(ticks)):
-                sightings = fuser.measure(seen)
             clocks.add(fusion_stage.on_one_clock(seen.rows(seen.body != NOBODY)))
-            measured = sightings.measured
-            sink.tables.table("measurements", measurement_columns(measured))
-            track = SkeletonTrack(measured.capture_ns, measured.points_m, measured.confidence)
-            checks.add(measured.camera, track)
         with sink.watch.stage("fuse", len(ticks)):
-            states, events, trace = fuser.advance(ticks, sightings)
+            (states, events, trace), sightings = fuser.advance(ticks, sightings)
+        if seen is not None:
+            sink.tables.table("measurements", measurement_columns(sightings.measured))
+            checks.add(sightings.measured)
         if smooth:
             for part in smoother.add(states, trace):
                 sink.tables.table("smooth", state_columns(part))
@@ -221,7 +221,7 @@ def fuse_batches(
     with sink.watch.stage("clocks", len(ticks_ns)):
         sink.notes["fuse"].extend(clocks.remarks())
     sink.notes["fuse"].extend(_describe_late_frames(log, sink.counts, fusion_stage.clock_offset_ns))
-    write_checks(checks, sink)
+    checks.write(sink)
     sink.notes["fuse"].extend(_describe_area(log, fuser.area, sink.counts) if watched else ())
     sink.notes["fuse"].extend(_describe_others(sink.counts))
     if smooth:
@@ -265,6 +265,85 @@ def write_checks(checks: CameraChecks, sink: Sink) -> None:
     for name, rows in zip(("bodies", "agreement"), checks.figures(), strict=True):
         if rows:
             sink.tables.table(name, record_columns(rows))
+
+
+class PeopleChecks:
+    """The checks of the cameras by each person; those by the person shown most are written.
+
+    It also notes the people: from when to when, and who may be a thing that a tracker takes for a person.
+    """
+
+    #: A person that one of several cameras alone shows for this time within this distance may be a thing [s, m].
+    STILL_S, STILL_M = 5.0, 0.3
+
+    def __init__(self, cameras: tuple[str, ...]) -> None:
+        self._cameras = cameras
+        self._checks: dict[int, CameraChecks] = {}
+        self._parts: dict[int, list[Measurements]] = defaultdict(list)
+
+    def add(self, measured: Measurements) -> None:
+        """Adds the measurements of some frames."""
+        for number in sorted(set(measured.numbers.tolist())):
+            mine = measured.rows(measured.numbers == number)
+            checks = self._checks.setdefault(number, CameraChecks(self._cameras))
+            checks.add(mine.camera, SkeletonTrack(mine.capture_ns, mine.points_m, mine.confidence))
+            self._parts[number].append(replace(mine, person=None))
+
+    def write(self, sink: Sink) -> None:
+        """Writes the checks and notes."""
+        people = {number: Measurements.join(parts) for number, parts in self._parts.items()}
+        most = max(people, key=lambda number: len(people[number]), default=None)
+        write_checks(CameraChecks(self._cameras) if most is None else self._checks[most], sink)
+        if len(people) > 1:
+            sink.notes["fuse"].extend(self._describe(people))
+
+    def _describe(self, people: Mapping[int, Measurements]) -> Iterator[str]:
+        """Returns the note on several people, and one for each that may be a thing."""
+        start_ns = min(int(seen.capture_ns.min()) for seen in people.values())
+        spans = {
+            number: ((int(seen.capture_ns.min()) - start_ns) / NS, (int(seen.capture_ns.max()) - start_ns) / NS)
+            for number, seen in sorted(people.items())
+        }
+        each = ", ".join(f"person {number} from {a:.1f} to {b:.1f} s" for number, (a, b) in spans.items())
+        yield (
+            f"{len(people)} bodies were tracked, and the robot keeps clear of all of them: {each} after the first frame"
+        )
+        for number, (a, b) in spans.items():
+            shown_by, middle_m = np.unique(people[number].camera), np.nanmean(people[number].points_m, axis=1)
+            if len(shown_by) == 1 < len(self._cameras) and b - a >= self.STILL_S:
+                within_m = float(np.nanmax(np.nanmax(middle_m, axis=0) - np.nanmin(middle_m, axis=0)))
+                if within_m <= self.STILL_M:
+                    yield (
+                        f"person {number} may be no person: {self._cameras[shown_by[0]]} alone shows this body, which "
+                        f"stays within {within_m:.2f} m for {b - a:.1f} s; the robot keeps clear of it; would be "
+                        "right, if it is a thing: what hides it from the camera's tracker, or logs.people = nearest"
+                    )
+
+
+class PeopleSmoother:
+    """Smooths each person of a run; rows of one person are in order of time."""
+
+    def __init__(self, settings: Fusion) -> None:
+        self._settings = settings
+        self._each: dict[int, StretchSmoother] = {}
+
+    def add(self, states: HumanStates, trace: fuse.Trace) -> list[HumanStates]:
+        """Adds the next ticks; returns the stretches that they complete, smoothed."""
+        found = []
+        for number in sorted(set(states.numbers.tolist())):
+            mine = np.flatnonzero(states.numbers == number)
+            one = self._each.setdefault(number, StretchSmoother(self._settings))
+            found += _numbered(one.add(states.of_person(number), trace.rows(mine)), number)
+        return found
+
+    def finish(self) -> list[HumanStates]:
+        """Returns the remaining ticks, smoothed."""
+        return [part for number, one in sorted(self._each.items()) for part in _numbered(one.finish(), number)]
+
+
+def _numbered(parts: list[HumanStates], number: int) -> list[HumanStates]:
+    """The states of one person with its number; person 1 needs none."""
+    return parts if number == 1 else [replace(part, person=np.full(len(part), number)) for part in parts]
 
 
 class StretchSmoother:
@@ -362,14 +441,17 @@ def select_stored_ticks(first: int, count: int, store_every: float) -> Ints:
     return np.flatnonzero(np.floor(number / store_every) != np.floor((number - 1) / store_every))
 
 
-def store_volumes(volumes: SweptVolumes, ticks: Ints, horizon_s: Floats, tables: Tables) -> None:
-    """Writes hull vertices and volume above the floor for some ticks; a tick without a person has none.
+def store_volumes(
+    volumes: SweptVolumes, rows: Ints, horizon_s: Floats, tables: Tables, person: Ints | None = None
+) -> None:
+    """Writes hull vertices and volume above the floor for some rows; a row without a person has none.
 
     Args:
-        volumes: Of any ticks.
-        ticks: Rows of ``volumes`` to write.
+        volumes: Of any rows.
+        rows: Rows of ``volumes`` to write.
         horizon_s: (n,) time after its tick until which each row holds [s].
         tables: Receives the rows.
+        person: (n,) number of each row's person; None: person 1.
     """
     t_ns: list[int] = []
     limbs: list[str] = []
@@ -377,22 +459,23 @@ def store_volumes(volumes: SweptVolumes, ticks: Ints, horizon_s: Floats, tables:
     sizes: list[float] = []
     hulls: list[Floats] = []
     horizons: list[float] = []
-    for tick in ticks.tolist():
+    people: list[int] = []
+    for row in rows.tolist():
         for i, limb in enumerate(volumes.limbs):
-            vertices = volumes.vertices(tick, i)
+            vertices = volumes.vertices(row, i)
             if np.isnan(vertices).any():
                 continue
-            solid = InflatedHull.around(vertices, float(volumes.radius_m[tick, i]))
-            t_ns.append(int(volumes.t_ns[tick]))
+            solid = InflatedHull.around(vertices, float(volumes.radius_m[row, i]))
+            t_ns.append(int(volumes.t_ns[row]))
             limbs.append(limb)
             radii.append(solid.radius_m)
             sizes.append(solid.volume_above_m3(FLOOR_Z_M))
             hulls.append(solid.vertices_m)
-            horizons.append(float(horizon_s[tick]))
+            horizons.append(float(horizon_s[row]))
+            people.append(1 if person is None else int(person[row]))
     if t_ns:
-        tables.table(
-            "occupancy", occupancy_columns(np.array(t_ns), limbs, volumes.method, radii, sizes, hulls, horizons)
-        )
+        columns = occupancy_columns(np.array(t_ns), limbs, volumes.method, radii, sizes, hulls, horizons)
+        tables.table("occupancy", columns if person is None else with_person(columns, np.array(people)))
 
 
 def predict_batches(
@@ -401,20 +484,23 @@ def predict_batches(
     """Stage 2 alone: writes the volumes for the braking time T_s, for one tick in ``store_every``.
 
     Args:
-        states: Batches of the fused person.
+        states: Batches of the fused people.
         prediction_stage: Settings of the stage.
         store_every: Number of ticks per tick whose volumes are stored, 1 or more; need not be an integer.
         sink: Receives rows and times.
     """
     done = 0
     for batch in states:
-        stored = select_stored_ticks(done, len(batch), store_every)
-        with sink.watch.stage("predict", len(batch)):
+        ticks, first = batch.ticks()
+        stored = select_stored_ticks(done, len(ticks), store_every)
+        with sink.watch.stage("predict", len(ticks)):
             volumes = prediction_stage.volumes(batch)
+        rows = np.concatenate([np.arange(first[tick], first[tick + 1]) for tick in stored] or [stored])
         with sink.watch.stage("hulls", len(stored)):
-            store_volumes(volumes, stored, np.full(len(batch), prediction_stage.horizon_s), sink.tables)
-        done += len(batch)
-        sink.progress("predict", len(batch))
+            horizon_s = np.full(len(batch), prediction_stage.horizon_s)
+            store_volumes(volumes, rows, horizon_s, sink.tables, batch.person)
+        done += len(ticks)
+        sink.progress("predict", len(ticks))
         yield batch
 
 
@@ -430,31 +516,34 @@ def plan_batches(
     Writes a motion per method, and the volumes of the chosen method for one tick in ``store_every``.
 
     Args:
-        states: Batches of the fused person.
+        states: Batches of the fused people.
         surroundings: Obstacles of the robot.
         planners: Method -> its robot; the chosen one is first.
         store_every: Number of ticks per tick whose volumes are stored, 1 or more; need not be an integer; inf: none.
         sink: Receives rows and times.
     """
-    done = 0
+    done, most = 0, 1
     for batch in states:
         forecast = Forecast(surroundings, batch)
-        with sink.watch.stage("predict", len(batch)):
-            around = [forecast.predict(tick) for tick in range(len(batch))]
+        t_ns, most = forecast.t_ns, max(most, int(batch.numbers.max()))
+        with sink.watch.stage("predict", len(t_ns)):
+            around = [forecast.predict(tick) for tick in range(len(t_ns))]
         for name, planner in planners.items():
-            with sink.watch.stage(f"plan {name}", len(batch)):
-                motion = planner.follow(batch.t_ns, around, surroundings.names)
+            with sink.watch.stage(f"plan {name}", len(t_ns)):
+                motion = planner.follow(t_ns, around, surroundings.names_of(most))
             columns = motion_columns(motion) | nearest_columns(planner, motion)
             sink.tables.table("motion" if planner.chosen else f"motion_{name}", columns)
             if planner.chosen:
-                stored = select_stored_ticks(done, len(batch), store_every)
+                stored = select_stored_ticks(done, len(t_ns), store_every)
                 with sink.watch.stage("hulls", len(stored)):
                     for tick in stored.tolist():
-                        row = slice(tick, tick + 1)
-                        volumes = forecast.person.volumes(float(motion.horizon_s[tick]), tick, tick + 1)
-                        store_volumes(volumes, np.zeros(1, np.int64), motion.horizon_s[row], sink.tables)
-        done += len(batch)
-        sink.progress("plan", len(batch))
+                        rows, horizon_s = forecast.rows(tick), float(motion.horizon_s[tick])
+                        volumes = forecast.person.volumes(horizon_s, rows.start, rows.stop)
+                        there = np.arange(len(volumes))
+                        person = None if batch.person is None else batch.person[rows]
+                        store_volumes(volumes, there, np.full(len(there), horizon_s), sink.tables, person)
+        done += len(t_ns)
+        sink.progress("plan", len(t_ns))
         yield
 
 

@@ -371,13 +371,22 @@ _PART_NAMES = {
 }
 
 
+#: Between a limb and its person in the name of a volume of person 2, 3, ...
+_OF_PERSON = " of person "
+
+
 def part_name_text(part: str) -> str:
     """Returns the name for readers of a part of a recorded body."""
+    limb, of, number = part.partition(_OF_PERSON)
+    if of:
+        return f"{part_name_text(limb)}{of}{number}"
     return LIMB_NAMES.get(part) or _PART_NAMES.get(part, part)
 
 
 def neighbour_text(part: str) -> str:
     """Describes the neighbour of a link: a part of the person, or the border beyond which others may be."""
+    if _OF_PERSON in part:
+        return f"the {part_name_text(part)}"
     return f"the {part_name_text(part)}" if part == BORDER else f"the person's {part_name_text(part)}"
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from hrcreplay.records import LIMBS, RECORDED
 from hrcreplay.reporting.metrics.contact import PERSONS, SHOWN_PARTS, method_prefixes
 from hrcreplay.reporting.metrics.fusion import add_limbs
+from hrcreplay.reporting.metrics.people import TRACKED
 from hrcreplay.reporting.metrics.series import Metric, MetricTable
 from hrcreplay.reporting.tables import PageTable, counted, limb_names_text, part_name_text, percent, share_text, text_of
 from hrcreplay.settings.sections import setting, with_new_names
@@ -154,6 +155,11 @@ def scope(run: Run, metrics: Metrics) -> tuple[str, ...]:
     """Describes the scope of the verdict: considered and ignored parts."""
     others = metrics["others_frames"]["value"]
     people = "One person is planned for"
+    if (tracked := metrics.get(TRACKED)) is not None:
+        people = f"{tracked['value']} people are planned for, each by a prediction of its own"
+        if brief := metrics["bodies_seen_briefly"]["value"]:
+            bodies = "1 further body was" if brief == 1 else f"{brief} further bodies were"
+            people += f"; {bodies} seen too briefly for that and counted by the points alone"
     if others:
         people += (
             f"; {counted(others, 'frame')} show at least one other body, which counts for contact, but the robot did "
@@ -255,7 +261,18 @@ def _held(metrics: Metrics) -> str:
     if not parts:
         return ""
     judge = metrics["contact_person"]["value"]
-    return f"The predicted volumes held every limb that was seen ({judge}) {', and '.join(parts)}."
+    return f"The predicted volumes held every limb that was seen ({judge}) {', and '.join(parts)}.{_held_each(metrics)}"
+
+
+def _held_each(metrics: Metrics) -> str:
+    """Describes the coverage of each of several people until the horizon."""
+    shares = {
+        name.split("_")[1]: metric["value"]
+        for name, metric in metrics.items()
+        if name.startswith("person_") and name.endswith("_volumes_held_share") and metric["value"] is not None
+    }
+    each = ", ".join(f"person {number} at {share_text(share)}" for number, share in shares.items())
+    return f" Until their horizon they held {each} of the ticks checked of each." if each else ""
 
 
 def _centimetres(metres: float) -> str:
@@ -269,6 +286,8 @@ def _pair(metrics: Metrics) -> str:
     )
     if ", body " in source:
         return f"{link} and the {part_name_text(limb)} of another body ({source})"
+    if source.startswith("person "):
+        return f"{link} and the {part_name_text(limb)} of {source.partition(',')[0]}"
     return f"{link} and the person's {part_name_text(limb)}"
 
 

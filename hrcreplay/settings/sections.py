@@ -161,10 +161,14 @@ class Logs(Section):
     robot_capsules: RobotCapsules | None = None
     """Capsules of the recorded robot, used if the log has no joints of the robot; none: those of a topic of the type
     reachable_occupancy/ReachableOccupancy."""
+    people: Literal["all", "nearest"] = "all"
+    """all: every body is tracked, predicted, and kept clear of; nearest: only the person that ``person_jump_m`` and
+    ``person_memory_s`` choose, at first the body nearest to its camera."""
     person_jump_m: Positive = 0.8
-    """A body further than this from the person's last position is another person [m]."""
+    """A body further than this from a person's last position is another person [m]."""
     person_memory_s: Positive = 2.0
-    """After this time without the person, the nearest body becomes the person [s]."""
+    """A person unseen for this time is forgotten; the last one is unknown until the nearest body becomes the person
+    [s]."""
     gap_s: Positive = 0.2
     """A longer time without frames counts as a gap of the camera [s]."""
 

@@ -34,9 +34,17 @@ _HEIGHT, _AS_LENGTH = JOINTS.index("z"), "pi_pelvis_height"
 _LENGTHS = (_AS_LENGTH, *LENGTHS)
 
 
+def with_person(columns: Columns, person: Ints | None) -> Columns:
+    """Returns the columns with the number of each row's person after the first; unchanged for None: person 1."""
+    if person is None:
+        return columns
+    (first, instants), *rest = columns.items()
+    return {first: instants, "person": person, **dict(rest)}
+
+
 def measurement_columns(measurements: Measurements) -> Columns:
-    """Returns one row per frame: the result of the closed-form inverse kinematics."""
-    return {
+    """Returns one row per frame and person: the result of the closed-form inverse kinematics."""
+    columns = {
         "capture_ns": measurements.capture_ns,
         "arrival_ns": measurements.arrival_ns,
         "camera": _names(measurements.camera, measurements.cameras),
@@ -45,6 +53,7 @@ def measurement_columns(measurements: Measurements) -> Columns:
         _AS_LENGTH: measurements.angles[:, _HEIGHT],
         **_spread(measurements.lengths_m, LENGTHS),
     }
+    return with_person(columns, measurements.person)
 
 
 def truth_columns(t_ns: Ints, angles: Floats, lengths_m: Floats) -> Columns:
@@ -62,8 +71,8 @@ _SHOWN = tuple(f"point_{point}_{axis}" for point in POINTS for axis in "xyz")
 
 
 def state_columns(states: HumanStates) -> Columns:
-    """Returns one row per tick: joints with derivatives and deviations, lengths, limbs, and the cameras used."""
-    columns: Columns = {"t_ns": states.t_ns}
+    """Returns one row per tick and person: joints with derivatives and deviations, lengths, limbs, cameras used."""
+    columns = with_person({"t_ns": states.t_ns}, states.person)
     for field, suffix in _STATE:
         columns |= _spread(getattr(states, field), JOINTS, suffix)
     columns |= _spread(states.lengths_m, LENGTHS) | _spread(states.lengths_std_m, LENGTHS, "_std")
@@ -108,25 +117,43 @@ def missing_columns(path: Path) -> tuple[str, ...]:
 
 
 def read_states(path: Path, chunk_ticks: int) -> Iterator[HumanStates]:
-    """Reads state.parquet into records, bit for bit, ``chunk_ticks`` rows at a time."""
+    """Reads state.parquet into records, bit for bit, about ``chunk_ticks`` rows at a time; no tick is divided."""
+    pending: HumanStates | None = None
     with pq.ParquetFile(path) as file:
         cameras = tuple(n.removeprefix("valid_") for n in file.schema_arrow.names if n.startswith("valid_"))
         for batch in file.iter_batches(batch_size=chunk_ticks):
-            column = {name: batch.column(name).to_numpy(zero_copy_only=False) for name in batch.schema.names}
-            yield HumanStates(
-                t_ns=column["t_ns"],
-                **{field: _gather(column, JOINTS, suffix) for field, suffix in _STATE},
-                lengths_m=_gather(column, LENGTHS),
-                lengths_std_m=_gather(column, LENGTHS, "_std"),
-                valid=np.column_stack([column[f"valid_{camera}"] for camera in cameras]),
-                residual_m=_gather(column, _RESIDUAL),
-                unseen_s=_gather(column, _UNSEEN),
-                frame_age_s=column[_FRAME_AGE],
-                points_m=_gather(column, _SHOWN).reshape(-1, len(POINTS), 3),
-                cameras=cameras,
-                nobody_s=column.get("nobody_s"),
-                nobody_else_s=column.get("nobody_else_s"),
+            states = _states(
+                {name: batch.column(name).to_numpy(zero_copy_only=False) for name in batch.schema.names}, cameras
             )
+            if states.person is None:
+                yield states
+                continue
+            if pending is not None:  # its last tick may go on in this chunk
+                whole = int(np.searchsorted(pending.t_ns, pending.t_ns[-1]))
+                if whole:
+                    yield pending.rows(slice(0, whole))
+                states = HumanStates.join([pending.rows(slice(whole, None)), states])
+            pending = states
+    if pending is not None:
+        yield pending
+
+
+def _states(column: Columns, cameras: tuple[str, ...]) -> HumanStates:
+    return HumanStates(
+        t_ns=column["t_ns"],
+        **{field: _gather(column, JOINTS, suffix) for field, suffix in _STATE},
+        lengths_m=_gather(column, LENGTHS),
+        lengths_std_m=_gather(column, LENGTHS, "_std"),
+        valid=np.column_stack([column[f"valid_{camera}"] for camera in cameras]),
+        residual_m=_gather(column, _RESIDUAL),
+        unseen_s=_gather(column, _UNSEEN),
+        frame_age_s=column[_FRAME_AGE],
+        points_m=_gather(column, _SHOWN).reshape(-1, len(POINTS), 3),
+        cameras=cameras,
+        nobody_s=column.get("nobody_s"),
+        nobody_else_s=column.get("nobody_else_s"),
+        person=column.get("person"),
+    )
 
 
 def occupancy_columns(
@@ -256,6 +283,22 @@ def contact_columns(
         "left_limb": _names(left[1], left[2]),
         "left_full_m": left_full[0],
         "left_full_limb": _names(left_full[1], left_full[2]),
+    }
+
+
+def person_columns(number: int, distance_m: Floats, left_m: Floats, left_full_m: Floats) -> Columns:
+    """Returns the further columns of contact for one of several people.
+
+    Args:
+        number: Number of the person.
+        distance_m: (n,) distance of the robot's surface; NaN: unknown [m].
+        left_m: (n,) as ``left`` of ``contact_columns`` [m].
+        left_full_m: (n,) as ``left_full`` [m].
+    """
+    return {
+        f"person_{number}_m": distance_m,
+        f"left_person_{number}_m": left_m,
+        f"left_full_person_{number}_m": left_full_m,
     }
 
 

@@ -12,9 +12,9 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -47,8 +47,23 @@ def to_json(value: Any) -> str:
     return json.dumps(value, indent=2, sort_keys=True, allow_nan=False) + "\n"
 
 
+#: Columns that a table has only if a row needs another value than this.
+OPTIONAL = {"person": 1}
+
+
+def fill_optional(table: pa.Table, names: Sequence[str]) -> pa.Table:
+    """Returns a table with the optional columns that another one with these columns has."""
+    for at, name in enumerate(names):
+        if name in OPTIONAL and name not in table.column_names:
+            table = table.add_column(at, name, [pa.array(np.full(len(table), OPTIONAL[name]))])
+    return table
+
+
 class TableWriter:
-    """A parquet file written chunk by chunk, in row groups of a fixed size for any chunk size."""
+    """A parquet file written chunk by chunk, in row groups of a fixed size for any chunk size.
+
+    If an optional column comes only with later rows, the earlier ones are written again with it.
+    """
 
     ROWS = 4096
 
@@ -59,11 +74,29 @@ class TableWriter:
 
     def write(self, columns: Mapping[str, Any]) -> None:
         """Appends rows given as columns: numpy arrays or arrow arrays."""
-        self._waiting.append(arrow_table(columns))
+        table = arrow_table(columns)
+        if self._waiting:
+            table = fill_optional(table, self._waiting[0].column_names)
+            if table.num_columns > self._waiting[0].num_columns:
+                self._widen(table.column_names)
+        self._waiting.append(table)
         while sum(len(table) for table in self._waiting) >= self.ROWS:
             table = pa.concat_tables(self._waiting).combine_chunks()
             self._flush(table.slice(0, self.ROWS))
             self._waiting = [table.slice(self.ROWS)]
+
+    def _widen(self, names: Sequence[str]) -> None:
+        """Writes all rows so far again, with the optional columns among ``names``."""
+        before = self._waiting
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
+            before = [pq.read_table(self._path), *before]
+        self._waiting = [fill_optional(pa.concat_tables(before), names)]
+        while len(self._waiting[0]) >= self.ROWS:
+            whole = self._waiting[0]
+            self._flush(whole.slice(0, self.ROWS))
+            self._waiting = [whole.slice(self.ROWS)]
 
     def _flush(self, table: pa.Table) -> None:
         if self._writer is None:
@@ -188,6 +221,24 @@ class Run:
     baselines: dict[str, pd.DataFrame] = field(default_factory=dict)
     counts: dict[str, int] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+
+    @property
+    def people(self) -> tuple[int, ...]:
+        """Numbers of the people with a fused state, from 1; (1,) for a run with one person."""
+        if self.state is None or "person" not in self.state:
+            return (1,)
+        return tuple(sorted({1, *self.state["person"][self.state["x"].notna()].tolist()}))
+
+    def of_person(self, number: int) -> Self:
+        """The run as if it had tracked one person alone; the motion is that near all people."""
+
+        def rows(table: pd.DataFrame | None) -> pd.DataFrame | None:
+            if table is None or "person" not in table:
+                return table
+            return table[table["person"] == number].drop(columns="person").reset_index(drop=True)
+
+        state, measurements, occupancy = map(rows, (self.state, self.measurements, self.occupancy))
+        return replace(self, state=state, measurements=measurements, occupancy=occupancy)
 
     @property
     def T_world_base(self) -> Floats | None:

@@ -46,6 +46,7 @@ def _eyes() -> FusionStage:
         limits=load_limits("human"),
         person_jump_m=0.8,
         person_memory_s=2.0,
+        people="nearest",
     )
 
 

@@ -107,7 +107,8 @@ def test_stop_share_of_the_qp_is_below_that_of_scaling(demo_folder: Path) -> Non
 def _predicted(run: Run, ticks: Sequence[int], horizon_s: Floats | None) -> list[SweptVolumes]:
     """The volumes of some ticks, predicted anew from the run's own table of states; NaN where nobody is known."""
     stage = assembly.prediction_stage(resolve("predict", run.folder))
-    (states,) = read_states(run.folder / "state.parquet", 1_000_000)
+    (people,) = read_states(run.folder / "state.parquet", 1_000_000)
+    states = people.of_person(1)
     horizons = np.full(len(states), stage.horizon_s) if horizon_s is None else horizon_s
     return [stage.volumes(states.rows(slice(k, k + 1)), float(horizons[k])) for k in ticks]
 
@@ -115,7 +116,8 @@ def _predicted(run: Run, ticks: Sequence[int], horizon_s: Floats | None) -> list
 def _volumes(run: Run) -> SweptVolumes:
     """Those of every tick until the braking time."""
     stage = assembly.prediction_stage(resolve("predict", run.folder))
-    (states,) = read_states(run.folder / "state.parquet", 1_000_000)
+    (people,) = read_states(run.folder / "state.parquet", 1_000_000)
+    states = people.of_person(1)
     return stage.volumes(states)
 
 

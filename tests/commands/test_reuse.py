@@ -41,6 +41,7 @@ STALE = {
     "logs.joints_unit": "plan",
     "logs.joints_offset_s": "plan",
     "logs.robot_capsules": ALL,
+    "logs.people": ALL,
     "logs.person_jump_m": ALL,
     "logs.person_memory_s": ALL,
     "logs.gap_s": "fuse",  # its counts

@@ -13,7 +13,7 @@ import pytest
 from hrcreplay.commands import replay, report
 from hrcreplay.evaluation import contact
 from hrcreplay.evaluation.contact import VOLUME_OF, Volumes
-from hrcreplay.evaluation.recorded_person import BodyTrack, from_states
+from hrcreplay.evaluation.recorded_person import BodyTrack, RecordedPeople, RecordedPerson, from_states
 from hrcreplay.human.model import PARTS
 from hrcreplay.logs import reader
 from hrcreplay.records import LIMBS, POINTS, Floats, HumanStates, SweptVolume
@@ -158,7 +158,8 @@ class Known:
         self.solid = {"LRA": SweptVolume(centre_m + 1e-3 * np.vstack([np.zeros(3), np.eye(3)]), radius_m)}
         self.asked: list[tuple[int, float]] = []
 
-    def volumes(self, t_ns: int, horizon_s: float) -> Volumes:
+    def volumes(self, t_ns: int, horizon_s: float, person: int) -> Volumes:
+        assert person == 1
         self.asked.append((t_ns, horizon_s))
         return self.solid
 
@@ -171,9 +172,10 @@ def test_a_contact_is_laid_at_the_door_of_robot_or_prediction(robot: RobotModel)
     found = near(robot, motion, body)
     touching = np.flatnonzero(found.distance_m <= 0.0)
     motion.loc[touching[2] - 3 : touching[-1], "status"] = "braking"  # what was decided before goes on
+    alone = RecordedPeople((RecordedPerson(1, body.source, body.t_ns, body.points_m, (body,)),), ())
     for ball_m, sign in ((0.5, -1.0), (0.1, 1.0)):
         known = Known(at, ball_m)
-        outside = contact.by_volume(motion, found, [body], RADII_M, 0.0, known)  # type: ignore[arg-type]
+        outside = contact.by_volume(motion, found, alone, RADII_M, 0.0, known)  # type: ignore[arg-type]
         np.testing.assert_array_equal(np.flatnonzero(np.isfinite(outside)), touching)
         np.testing.assert_allclose(outside[touching], 0.2 + 0.05 - ball_m, atol=3e-3)
         assert (np.sign(outside[touching]) == sign).all()
@@ -181,7 +183,7 @@ def test_a_contact_is_laid_at_the_door_of_robot_or_prediction(robot: RobotModel)
         assert known.asked[-1] == (decided * DT_NS, 0.04)
     no_legs = Known(at, 0.5)
     no_legs.solid = {"LEGS": no_legs.solid["LRA"]}
-    assert np.isnan(contact.by_volume(motion, found, [body], RADII_M, 0.0, no_legs)).all()  # type: ignore[arg-type]
+    assert np.isnan(contact.by_volume(motion, found, alone, RADII_M, 0.0, no_legs)).all()  # type: ignore[arg-type]
 
 
 def test_parts_are_held_against_the_volume_of_their_limb() -> None:

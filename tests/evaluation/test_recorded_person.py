@@ -23,6 +23,7 @@ from tests.facts import tells
 from tests.undrawn import undrawn
 
 SPAN = {"start_s": 8.0, "end_s": 12.0}
+ONE = "logs.people=nearest"
 BLIND = ("plan.method=none", "plan.baselines=[]")
 #: Where the bystander stands beside the worker in the world: nearer to both cameras, out of the robot's reach [m].
 ASIDE_M = np.array([-2.4, 0.0, 0.0])
@@ -120,7 +121,7 @@ def beside(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_worker_whom_a_bystander_hides_is_touched_all_the_same(beside: Path, tmp_path: Path) -> None:
     """The bystander is nearer to the cameras, so the robot's person is that one: the worker is another body."""
-    metrics, contact, motion = reported(beside, tmp_path / "run", *BLIND)
+    metrics, contact, motion = reported(beside, tmp_path / "run", *BLIND, ONE)
     alone, _, _ = reported(rewritten(tmp_path / "alone.mcap"), tmp_path / "alone", *BLIND)
     frames = sum(len(part) for part in open_log(beside).frames())
     assert metrics["others_frames"] == pytest.approx(frames / 2, abs=3)
@@ -139,9 +140,20 @@ def test_a_worker_whom_a_bystander_hides_is_touched_all_the_same(beside: Path, t
     )
 
 
+def test_a_robot_that_heeds_all_people_has_no_other_bodies(beside: Path, tmp_path: Path) -> None:
+    metrics, contact, motion = reported(beside, tmp_path / "run", *BLIND)
+    assert metrics["people_tracked"] == 2
+    assert metrics["others_frames"] == metrics["plan_touch_other_ticks"] == 0
+    assert 20 < int(str(metrics["plan_touch_person_ticks"])) == metrics["plan_touch_moving_ticks"]
+    by_hand = nearest_by_hand(beside, motion, bodies=range(50))
+    for tick, least_m in by_hand.items():
+        if least_m <= 0.2:
+            assert contact["person_m"].iloc[tick] <= least_m + 0.02
+
+
 def test_with_ground_truth_whoever_stands_elsewhere_is_another_body(tmp_path: Path) -> None:
     log = rewritten(tmp_path / "both.mcap", bystander=True, truth=True)
-    metrics, contact, _ = reported(log, tmp_path / "run", *BLIND)
+    metrics, contact, _ = reported(log, tmp_path / "run", *BLIND, ONE)
     assert metrics["contact_person"] == "ground truth"
     assert int(str(metrics["plan_touch_person_ticks"])) > 20
     assert metrics["plan_touch_other_ticks"] == 0

@@ -24,6 +24,8 @@ from tests.facts import facts, tells
 from tests.visits import Visitors, cell_around, visit_log
 
 ALONE = ("plan.baselines=[]", "prediction.store_hz=1")
+#: A robot that heeds one person, beside whom the border is all that keeps it clear of others.
+ONE = "logs.people=nearest"
 HALF_M = 2.5
 
 
@@ -121,7 +123,7 @@ def test_a_second_person_who_comes_in_unheeded_is_not_touched(tmp_path: Path, si
         first = {1: (-1.6 * side[0], -1.6 * side[1] - 0.3)}
         return first | ({2: (max(away_m, 0.6) * side[0], max(away_m, 0.6) * side[1])} if s > 3.5 else {})
 
-    folder = run(tmp_path, visitors, 6.5, "plan.method=qp", command="report")
+    folder = run(tmp_path, visitors, 6.5, "plan.method=qp", ONE, command="report")
     motion, state = tables(folder)
     contact = pq.read_table(folder / "contact.parquet").to_pandas()
     assert not (contact["moving"] & (contact["distance_m"] < 0.0)).any()
@@ -131,14 +133,31 @@ def test_a_second_person_who_comes_in_unheeded_is_not_touched(tmp_path: Path, si
     assert motion["tcp_speed"][motion["s"] < 4.0].max() > 0.3
 
 
+def test_a_second_person_who_is_tracked_is_not_touched_without_a_border(tmp_path: Path) -> None:
+    """The visitors of the next test; the robot heeds both of them."""
+    folder = run(tmp_path, second_comes_in, 9.0, command="report", watched=None)
+    contact = pq.read_table(folder / "contact.parquet").to_pandas()
+    assert contact["distance_m"].min() < 0.3  # they came
+    assert not (contact["moving"] & (contact["distance_m"] < 0.0)).any()
+
+
+def test_two_tracked_people_in_a_watched_area_do_not_make_the_border_come_in(tmp_path: Path) -> None:
+    folder = run(tmp_path, lambda _s: {1: (-1.8, -0.4), 2: (1.8, 1.2)}, 6.0)
+    motion, state = tables(folder)
+    assert set(state["person"]) == {1, 2}
+    assert (state["nobody_else_s"][state["s"] > 4.0] < 0.2).all()
+    assert motion["tcp_speed"][motion["s"] > 4.0].max() > 0.2
+
+
+def second_comes_in(s: float) -> dict[int, tuple[float, float]]:
+    """Somebody who stays behind the robot, and a second one who walks up to it."""
+    first = {1: (-1.6, -0.3)}
+    return first | ({2: (max(3.4 - 1.6 * (s - 3.5), 0.45), 0.0)} if s > 3.5 else {})
+
+
 def test_without_a_border_the_second_person_is_touched(tmp_path: Path) -> None:
-    """What the border is worth: the same visitors in a cell that says nothing."""
-
-    def visitors(s: float) -> dict[int, tuple[float, float]]:
-        first = {1: (-1.6, -0.3)}
-        return first | ({2: (max(3.4 - 1.6 * (s - 3.5), 0.45), 0.0)} if s > 3.5 else {})
-
-    folder = run(tmp_path, visitors, 9.0, command="report", watched=None)
+    """What the border is worth: the same visitors in a cell that says nothing, beside a robot that heeds one."""
+    folder = run(tmp_path, second_comes_in, 9.0, ONE, command="report", watched=None)
     contact = pq.read_table(folder / "contact.parquet").to_pandas()
     assert (contact["moving"] & (contact["distance_m"] < 0.0)).any()
 
@@ -194,7 +213,7 @@ def test_a_body_whose_track_is_frozen_is_not_gone(tmp_path: Path) -> None:
 
 
 def test_an_area_that_is_never_without_others_is_told_and_the_robot_stands(tmp_path: Path) -> None:
-    folder = run(tmp_path, lambda _s: {1: (-1.8, -0.4), 2: (1.8, 1.2)}, 3.5)
+    folder = run(tmp_path, lambda _s: {1: (-1.8, -0.4), 2: (1.8, 1.2)}, 3.5, ONE)
     motion, state = tables(folder)
     assert np.isinf(state["nobody_else_s"]).all()
     assert (motion["tcp_speed"] == 0.0).all()

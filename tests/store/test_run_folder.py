@@ -6,10 +6,12 @@ import subprocess
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from hrcreplay.errors import SettingsError
 from hrcreplay.store import run_folder
+from hrcreplay.store.run_folder import TableWriter
 from tests.facts import facts
 
 
@@ -98,3 +100,24 @@ def test_stopwatch_spreads_a_call_over_its_ticks() -> None:
     assert found["median_us"] == 1000.0  # 10 ticks shared 10 ms
     assert found["max_us"] == 30_000.0
     assert found["real_time_factor"] == pytest.approx(11 * 0.004 / 0.040)
+
+
+@pytest.mark.parametrize("first", [0, 1, 4096, 9000])
+def test_a_column_that_comes_late_gives_the_bytes_of_a_table_that_always_had_it(tmp_path: Path, first: int) -> None:
+    """Rows before ``first`` are of person 1 and do not say so."""
+    n = 10_000
+    t_ns, person = np.arange(n), np.where(np.arange(n) < first, 1, 2)
+
+    def write(path: Path, size: int, *, always: bool) -> bytes:
+        table = TableWriter(path)
+        for begin in range(0, n, size):
+            rows = slice(begin, begin + size)
+            named = always or (person[rows] != 1).any()
+            columns = {"t_ns": t_ns[rows], "person": person[rows], "x": 0.5 * t_ns[rows]}
+            table.write(columns if named else {name: columns[name] for name in ("t_ns", "x")})
+        table.close()
+        return path.read_bytes()
+
+    late = write(tmp_path / "late.parquet", 250, always=False)
+    assert late == write(tmp_path / "whole.parquet", 777, always=True)
+    assert pq.read_table(tmp_path / "late.parquet")["person"].to_pylist() == person.tolist()

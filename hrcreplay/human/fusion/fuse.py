@@ -28,7 +28,7 @@ from hrcreplay.human.fusion.kernel import run
 from hrcreplay.human.fusion.model_residual import BINS
 from hrcreplay.human.fusion.reported_deviations import FIRST_SPREAD
 from hrcreplay.human.model import LEFT_ARM, RIGHT_ARM, LimitSet, nearest
-from hrcreplay.records import BODY, DOF, LENGTHS, LIMBS, POINTS, Floats, HumanStates, Ints, Measurements
+from hrcreplay.records import BODY, DOF, LENGTHS, LIMBS, POINTS, Bools, Floats, HumanStates, Ints, Measurements
 from hrcreplay.settings.sections import Fusion
 
 #: Prior of an unmeasured person: upright with hanging arms, and its standard deviation [m, m, rad..., m].
@@ -54,7 +54,7 @@ class Trace:
     spread: Floats  #: (n, 13) highest normalised innovation squared, decaying
     autocorrelation: Floats  #: (n, 13) autocorrelation of the innovations, at lag 1
 
-    def rows(self, which: slice) -> Trace:
+    def rows(self, which: slice | Ints | Bools) -> Trace:
         """Selects the trace of some of the ticks."""
         return Trace(*(getattr(self, f.name)[which] for f in fields(Trace)))
 

@@ -3,8 +3,9 @@
 The area is vacant at an instant if all cameras have sent frames up to it, for long enough and without a gap, and every
 body seen inside was later seen outside. A body that was lost inside may still be there, but only for a limited time:
 trackers lose people and report false ones. After the instant, no person can be deeper inside than people walk in the
-time since. A body counts at every place where a camera shows one of its points, for the person that the filter follows
-and for others; a body without points may be anywhere.
+time since. A body counts at every place where a camera shows one of its points, for the people that the filters follow
+and for others; a body without points may be anywhere. Each person has an instant of its own: the last at which neither
+this person nor anybody whom no filter follows was inside.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hrcreplay.geometry.polygon import ConvexPolygon
-from hrcreplay.records import NOBODY, Bools, CameraFrames, Floats, HumanStates
+from hrcreplay.records import NOBODY, CameraFrames, Floats, HumanStates, Ints
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class Sighting(NamedTuple):
 
     capture_ns: int
     inside: bool
-    other: bool  #: True: not the person
+    person: int  #: number of the person; 0: nobody that a filter follows
 
 
 class VacancyState(NamedTuple):
@@ -49,6 +50,7 @@ class VacancyState(NamedTuple):
     begin_ns: tuple[int, ...]  #: camera -> start of its frames without a gap
     bodies: tuple[tuple[tuple[int, int], Sighting], ...]  #: camera and body id -> its last sighting, while relevant
     vacant_ns: tuple[int, int]  #: when the area was last empty, and last without other people; -1 before the first time
+    people_ns: tuple[tuple[int, int], ...] = ()  #: person -> when it was last without this person and without others
 
 
 def start(cameras: int) -> VacancyState:
@@ -57,38 +59,58 @@ def start(cameras: int) -> VacancyState:
 
 
 def watch(
-    state: VacancyState, states: HumanStates, frames: CameraFrames, mine: Bools, area: WatchedArea
+    state: VacancyState, states: HumanStates, frames: CameraFrames, person: Ints, area: WatchedArea
 ) -> tuple[VacancyState, HumanStates, Counter[str]]:
-    """Adds to each tick the time since the area was certainly empty, and since it was so except for the person.
+    """Adds to each row the time since the area was certainly without its person, and since it was so but for people.
 
     Args:
         state: From the previous table; ``start`` at the beginning.
-        states: The fused person at the ticks, increasing.
+        states: The fused people at the ticks, increasing.
         frames: All bodies that arrived after the tick before the first and up to the last, in order of arrival, and the
             frames without a body; points in the world [m].
-        mine: (n,) True for the person.
+        person: (n,) number of each body's person; 0: another body; negative: the person shown twice.
         area: The watched area.
 
     Returns:
         The new state; ``states`` with ``nobody_s`` and ``nobody_else_s``; and the count ``watched_frames_refuting``,
         of frames that show a person deeper inside than people can walk since the area was vacant.
     """
-    depth_m = _depths(frames, area)
+    depth_m, numbers = _depths(frames, area), np.abs(person).astype(np.int64).tolist()
     counts: Counter[str] = Counter()
     ages = np.empty((len(states), 2))
-    last = np.searchsorted(frames.arrival_ns, states.t_ns, side="right").tolist()
+    ticks_ns, first = states.ticks()
+    there = states.numbers.tolist()
+    last = np.searchsorted(frames.arrival_ns, ticks_ns, side="right").tolist()
     row = 0
-    for tick, t_ns in enumerate(states.t_ns.tolist()):
+    for tick, t_ns in enumerate(ticks_ns.tolist()):
+        rows = slice(int(first[tick]), int(first[tick + 1]))
+        state = _know(state, there[rows])
         for k in range(row, last[tick]):
             who = int(frames.camera[k]), int(frames.body[k])
-            seen = Sighting(int(frames.capture_ns[k]), bool(depth_m[k] > 0.0), not mine[k])
+            followed = numbers[k] if numbers[k] in there[rows] else 0
+            seen = Sighting(int(frames.capture_ns[k]), bool(depth_m[k] > 0.0), followed)
             if seen.inside and _refutes(state.vacant_ns[0], seen.capture_ns, float(depth_m[k]), area):
                 counts["watched_frames_refuting"] += 1
             state = _met(state, who, seen, round(area.gap_s * 1e9))
         row = last[tick]
         state = _decide_vacancy(state, round(area.clear_s * 1e9))
-        ages[tick] = [np.inf if at < 0 else (t_ns - at) / 1e9 for at in state.vacant_ns]
+        known_ns = dict(state.people_ns)
+        for k in range(rows.start, rows.stop):
+            instants = known_ns[there[k]], state.vacant_ns[1]
+            ages[k] = [np.inf if at < 0 else (t_ns - at) / 1e9 for at in instants]
     return state, replace(states, nobody_s=ages[:, 0], nobody_else_s=ages[:, 1]), counts
+
+
+def _know(state: VacancyState, people: list[int]) -> VacancyState:
+    """Returns the state with these people: one that is no more counts among the others, one that is new came later."""
+    known, others = dict(state.people_ns), state.vacant_ns[1]
+    if list(known) == people:
+        return state
+    gone = set(known) - set(people)
+    bodies = tuple((who, seen._replace(person=0) if seen.person in gone else seen) for who, seen in state.bodies)
+    others = min([others, *(known[number] for number in gone)])
+    people_ns = tuple((number, min(known.get(number, others), others)) for number in people)
+    return state._replace(bodies=bodies, vacant_ns=(state.vacant_ns[0], others), people_ns=people_ns)
 
 
 def _depths(frames: CameraFrames, area: WatchedArea) -> Floats:
@@ -123,9 +145,11 @@ def _decide_vacancy(state: VacancyState, clear_ns: int) -> VacancyState:
     if watched_ns < 0:
         return state
     bodies = tuple((who, seen) for who, seen in state.bodies if seen.capture_ns >= watched_ns - clear_ns)
-    inside = [seen for _, seen in bodies if seen.inside]
+    inside = {seen.person for _, seen in bodies if seen.inside}
     anybody, others = state.vacant_ns
+    people = dict(state.people_ns)
     if watched_ns - max(state.begin_ns) >= clear_ns:
         anybody = anybody if inside else max(anybody, watched_ns)
-        others = others if any(seen.other for seen in inside) else max(others, watched_ns)
-    return state._replace(bodies=bodies, vacant_ns=(anybody, others))
+        others = others if 0 in inside else max(others, watched_ns)
+        people = {number: at if inside & {0, number} else max(at, watched_ns) for number, at in state.people_ns}
+    return state._replace(bodies=bodies, vacant_ns=(anybody, others), people_ns=tuple(people.items()))

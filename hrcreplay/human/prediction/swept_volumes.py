@@ -24,6 +24,7 @@ from hrcreplay.human.model import (
     alpha_3_bounds,
     bounds_of,
 )
+from hrcreplay.human.prediction.shown_points import around_points, count_by_points
 from hrcreplay.human.prediction.sound_reach import SoundMotionLimits, enclose, start_states
 from hrcreplay.human.prediction.sound_volumes import SoundRows, SoundRules, sound_rows, sound_rules, sweep_sound
 from hrcreplay.human.prediction.sweep import MOST_COPIES, append, box, kinematic_chain, sweep_rot, sweep_walk
@@ -300,7 +301,19 @@ class PreparedPerson:
             last: Tick after the last one; None: all.
         """
         last, prediction = len(self.states) if last is None else last, self.predictor.prediction
-        t_ns = self.states.t_ns[first:last]
+        if self.by_points[first:last].any():
+            found, states = self._filtered(horizon_s, first, last), self.states.rows(slice(first, last))
+            return around_points(found, states, prediction, self.predictor.limbs_m, horizon_s)
+        return self._filtered(horizon_s, first, last)
+
+    @cached_property
+    def by_points(self) -> Bools:
+        """(n,) True for rows of bodies that count by their points alone."""
+        return count_by_points(self.states)
+
+    def _filtered(self, horizon_s: float, first: int, last: int) -> SweptVolumes:
+        """Volumes from the filtered states; unknown for bodies that have none."""
+        t_ns, prediction = self.states.t_ns[first:last], self.predictor.prediction
         if self.rows is None:
             return self._printed(self.states.rows(slice(first, last)), horizon_s)
         span_s, rules, work = horizon_s + prediction.latency_s, self.predictor.rules, self.predictor.work

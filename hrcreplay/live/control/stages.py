@@ -89,7 +89,7 @@ class Observer:
         person = look.obstacles
         if not horizon_s:
             person = obstacles(self._surroundings.prediction.volumes(look.states, 0.0), 0, 0.0)
-        found = self._surroundings.obstacles(look.states, 0, person)
+        found = self._surroundings.obstacles(look.states, [person])
         return found if believed else replace(found, known=False)
 
     def vacant_s(self, look: Perception | None, t_ns: int) -> float:

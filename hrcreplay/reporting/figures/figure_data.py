@@ -243,7 +243,7 @@ def _states(run_config: RunConfig, run: Run) -> HumanStates | None:
         wanted_ns.append(int(times(run.motion)[nearest_tick(run.motion)]))
     known_ns = np.array([t for t in wanted_ns if t is not None], dtype=np.int64)
     batches = read_states(run.folder / "state.parquet", 4096)
-    return HumanStates.join([batch.rows(np.isin(batch.t_ns, known_ns)) for batch in batches])
+    return HumanStates.join([batch.rows(np.isin(batch.t_ns, known_ns)) for batch in batches]).of_person(1)
 
 
 def _at(people: HumanStates, wanted_ns: Ints | int) -> HumanStates:

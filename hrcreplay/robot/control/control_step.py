@@ -305,7 +305,7 @@ def observe(
     surface, link, limb = pairs.nearest()
     if math.isnan(surface):
         return Sight(pose, None, math.nan, -1, -1, NO_DISTANCE)
-    return Sight(pose, pairs, max(0.0, surface), obstacles.first + limb, link, 0, max(0.0, -surface))
+    return Sight(pose, pairs, max(0.0, surface), obstacles.index(limb), link, 0, max(0.0, -surface))
 
 
 class Taken(NamedTuple):

@@ -7,6 +7,7 @@ rows; a row is computed only when a velocity violates it.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -30,6 +31,11 @@ class Obstacles:
     known: bool  #: False if a limb could not be predicted; the robot must then brake
     horizon_s: float = math.inf  #: time for which the volumes are valid, from their tick on [s]
     first: int = 0  #: index of the first volume among all possible volumes: the person's limbs, then the walls
+    numbers: Ints | None = None  #: (l,) index of each volume among all possible ones; None: from ``first`` on
+
+    def index(self, volume: int) -> int:
+        """Index of one of the volumes among all possible volumes."""
+        return self.first + volume if self.numbers is None else int(self.numbers[volume])
 
 
 def obstacles(volumes: SweptVolumes, tick: int, horizon_s: float = math.inf) -> Obstacles:
@@ -46,6 +52,25 @@ def obstacles(volumes: SweptVolumes, tick: int, horizon_s: float = math.inf) -> 
     offsets = offsets - offsets[0]
     around, known = boxes(vertices, offsets, radius)
     return Obstacles(vertices, offsets, radius, around, known, horizon_s)
+
+
+def join_obstacles(people: Sequence[Obstacles]) -> Obstacles:
+    """The volumes of several people of one tick as those of one, person after person; one or more."""
+    if len(people) == 1:
+        return people[0]
+    ends = np.cumsum([0, *(one.offsets[-1] for one in people)])
+    offsets = [one.offsets[1:] + end for one, end in zip(people, ends[:-1], strict=True)]
+    vertices, radius = (np.concatenate([getattr(one, name) for one in people]) for name in ("vertices_m", "radius_m"))
+    for array in (vertices, radius):  # like those of one person; otherwise numba compiles all kernels again
+        array.setflags(write=False)
+    return Obstacles(
+        vertices,
+        np.concatenate([np.zeros(1, np.int64), *offsets]),
+        radius,
+        np.concatenate([one.boxes_m for one in people]),
+        all(one.known for one in people),
+        min(one.horizon_s for one in people),
+    )
 
 
 @njit(cache=True)
