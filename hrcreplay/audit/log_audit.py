@@ -21,7 +21,7 @@ from hrcreplay.evaluation.containment import (
     recorded_future,
     select_rows,
 )
-from hrcreplay.evaluation.recorded_person import Recording, read_recording
+from hrcreplay.evaluation.recorded_person import Recording, read_recordings
 from hrcreplay.human.model import LimitSet
 from hrcreplay.human.prediction import swept_volumes
 from hrcreplay.human.prediction.swept_volumes import Reach, limb_radii
@@ -152,8 +152,12 @@ def shorter(prediction_stage: PredictionStage) -> tuple[float, ...]:
     return tuple(h for h in SHORTER_S if h < standstill_s(prediction_stage))
 
 
-def audit_log(run_config: RunConfig, name: str, watch: Stopwatch) -> LogAudit:
-    """Audits one log by all methods.
+def audit_log(run_config: RunConfig, name: str, watch: Stopwatch) -> list[LogAudit]:
+    """Audits each person of one log by all methods.
+
+    Returns:
+        One audit a person, named after the log; with several people also after the person. A person who was seen too
+        briefly is left out, with a note of the first audit.
 
     Raises:
         SettingsError: The cell does not fit the log.
@@ -170,9 +174,32 @@ def audit_log(run_config: RunConfig, name: str, watch: Stopwatch) -> LogAudit:
         )
     ticks_ns = tick_times(begin_ns, end_ns, run_config.settings.fusion.rate_hz)
     with ProgressBar(f"reading {name}", len(ticks_ns)) as bar, watch.stage("record", len(ticks_ns)):
-        recording = read_recording(
+        recordings = read_recordings(
             log, ticks_ns, assembly.fusion_stage(run_config, log), lambda n: bar.advance(f"reading {name}", n)
         )
+    found, left_out = [], []
+    for number, recording in recordings.items():
+        whose = name if len(recordings) == 1 else f"{name}, person {number}"
+        try:
+            found.append(_audit_person(run_config, whose, recording, tuple(log.notes), watch))
+        except LogError as error:
+            left_out.append((number, error))
+    if not found:
+        raise left_out[0][1]
+    more = tuple(f"person {number} is not audited: {error}" for number, error in left_out)
+    return [replace(found[0], notes=(*found[0].notes, *more)), *found[1:]]
+
+
+def _audit_person(
+    run_config: RunConfig, name: str, recording: Recording, told: tuple[str, ...], watch: Stopwatch
+) -> LogAudit:
+    """Audits one person by all methods.
+
+    Raises:
+        LogError: The person was not seen for longer than the horizon, or nothing can be checked.
+    """
+    prediction_stage = assembly.prediction_stage(run_config)
+    horizon_s = standstill_s(prediction_stage)
     fusion = run_config.settings.fusion
     rows = select_rows(recording.states, int(recording.t_ns[-1]), fusion.rate_hz, horizon_s, fusion.fresh_s)
     if not len(rows):
@@ -202,7 +229,7 @@ def audit_log(run_config: RunConfig, name: str, watch: Stopwatch) -> LogAudit:
     for method in swept_volumes.METHODS:
         interval = prediction_stage.by(method).reachable(future.states)
         joints[method] = joints_inside(recording, future.states, interval, horizon_s)
-    notes = (*log.notes, *_remarks(recording, len(rows) / AUDIT_HZ, horizon_s))
+    notes = (*told, *_remarks(recording, len(rows) / AUDIT_HZ, horizon_s))
     errors = errors_in_deviations(recording, rows)
     return LogAudit(run_config, name, recording, outcomes, joints, curve, horizons, errors, future.points(), notes)
 

@@ -90,8 +90,9 @@ def run(sources: Sequence[Path], *, out: Path | None = None, **options: Unpack[R
     with RunWriter(out or Path("reports") / run_configs[0].log.stem / f"{began:%Y%m%dT%H%M%SZ}-audit") as writer:
         watch = Stopwatch(time.perf_counter_ns)
         audits = [
-            audit_log(run_config, name, watch)
+            audit
             for run_config, name in zip(run_configs, _names(run_configs), strict=True)
+            for audit in audit_log(run_config, name, watch)
         ]
         for audit in audits:
             _write_rows(audit, writer)

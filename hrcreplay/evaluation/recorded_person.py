@@ -18,7 +18,7 @@ from hrcreplay.human.model import part_axes, skeleton
 from hrcreplay.logs.reader import Log
 from hrcreplay.pipeline.assembly import FusionStage
 from hrcreplay.pipeline.person_fuser import PersonFuser
-from hrcreplay.pipeline.stages import StretchSmoother, batches
+from hrcreplay.pipeline.stages import PeopleSmoother, batches
 from hrcreplay.records import (
     LENGTHS,
     POINTS,
@@ -351,13 +351,21 @@ _CHOSEN = -1
 
 
 def read_recording(log: Log, ticks_ns: Ints, fusion_stage: FusionStage, progress: Callable[[int], None]) -> Recording:
-    """Reads the recording within the span of ``ticks_ns``.
+    """Reads the recording of the nearest person alone; see ``read_recordings``."""
+    return read_recordings(log, ticks_ns, replace(fusion_stage, people="nearest"), progress)[1]
 
-    The recorded future is the ground truth if the log has it, else the points of the cameras at their capture times,
-    else the smoothed person. A camera point must have sufficient confidence (confidence 0: not seen). It must also be
-    within the filter's outlier distance of the smoothed person, which includes later frames, or at the end of a bone of
-    the person's length: the points of a person who squats or bends sideways leave the model but keep their bone
-    lengths, and a marker that jumps away does not. Recorded joints are those of the truth, else of the smoothed person.
+
+def read_recordings(
+    log: Log, ticks_ns: Ints, fusion_stage: FusionStage, progress: Callable[[int], None]
+) -> dict[int, Recording]:
+    """Reads the recording of each person within the span of ``ticks_ns``.
+
+    The recorded future is the ground truth if the log has it for this person, else the points of the cameras at their
+    capture times, else the smoothed person. A camera point must have sufficient confidence (confidence 0: not seen). It
+    must also be within the filter's outlier distance of the smoothed person, which includes later frames, or at the end
+    of a bone of the person's length: the points of a person who squats or bends sideways leave the model but keep their
+    bone lengths, and a marker that jumps away does not. Recorded joints are those of the truth, else of the smoothed
+    person. Of people without truth in a log that has it for another, the fused person takes the place of the smoothed.
 
     Args:
         log: Log to read.
@@ -365,26 +373,38 @@ def read_recording(log: Log, ticks_ns: Ints, fusion_stage: FusionStage, progress
         fusion_stage: Cameras and settings of stage 1.
         progress: Called with the number of ticks done since the last call.
 
+    Returns:
+        Number of the person -> recording, in the order of the numbers.
+
     Raises:
         LogError: No camera saw a person.
     """
     counts: Counter[str] = Counter()
     stretches = fuse_stretches(log, ticks_ns, fusion_stage, counts, progress)
-    truth = _truth(log, ticks_ns)
-    if truth is not None:
-        states = HumanStates.join([states for _, states, _ in stretches])
-        joints, _ = inverse_kinematics.inverse(truth.points_m)
-        return Recording(states, truth.t_ns, truth.points_m, truth.t_ns, joints, TRUTH, _plain(log, counts))
-    smoother, seen, passed, best = StretchSmoother(fusion_stage.filter), [], [], []
+    truth, smoother, seen, passed, best = _truth(log, ticks_ns), PeopleSmoother(fusion_stage.filter), [], [], []
     for measured, states, trace in stretches:
         seen.append(measured)
         passed.append(states)
-        best += smoother.add(states, trace)
-    smoothed, measurements = HumanStates.join([*best, *smoother.finish()]), Measurements.join(seen)
-    points, rejected = _select_accepted(measurements, smoothed, fusion_stage)
-    counts.update(rejected)
-    source, t_ns, points_m = _recorded_points(measurements, points, smoothed)
-    return Recording(HumanStates.join(passed), t_ns, points_m, smoothed.t_ns, smoothed.p, source, _plain(log, counts))
+        if truth is None:
+            best += smoother.add(states, trace)
+    fused, measurements = HumanStates.join(passed), Measurements.join(seen)
+    smoothed = fused if truth is not None else HumanStates.join([*best, *smoother.finish()])
+    of_truth = 0 if truth is None else _nearest_to(truth, measurements)
+    known = np.isfinite(fused.p[:, 0])
+    found = {}
+    for number in sorted(set(fused.numbers[known].tolist())) or [1]:
+        states, own = fused.of_person(number), smoothed.of_person(number)
+        if truth is not None and number == of_truth:
+            joints, _ = inverse_kinematics.inverse(truth.points_m)
+            whole = _plain(log, counts)
+            found[number] = Recording(states, truth.t_ns, truth.points_m, truth.t_ns, joints, TRUTH, whole)
+            continue
+        mine = _rows_of(measurements, number)
+        points, rejected = _select_accepted(mine, own, fusion_stage)
+        source, t_ns, points_m = _recorded_points(mine, points, own)
+        whole = _plain(log, counts + rejected)
+        found[number] = Recording(states, t_ns, points_m, own.t_ns, own.p, source, whole)
+    return found
 
 
 def _recorded_points(seen: Measurements, points: Floats, best: HumanStates) -> tuple[str, Ints, Floats]:
@@ -414,7 +434,7 @@ def fuse_stretches(
     Raises:
         LogError: No camera saw a person.
     """
-    fusion_stage = replace(fusion_stage, watched=None, people="nearest")
+    fusion_stage = replace(fusion_stage, watched=None)
     fuser, ever = PersonFuser(fusion_stage, log.header.cameras, traced=True), False
     for ticks, due in batches(log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1), ticks_ns, _BATCH):
         progress(len(ticks))

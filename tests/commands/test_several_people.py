@@ -13,10 +13,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from hrcreplay import api
-from hrcreplay.commands import replay
+from hrcreplay.commands import audit, replay
 from hrcreplay.commands.explain import explain, sentences
 from hrcreplay.store.columns import read_states
 from tests import crowd
+from tests.undrawn import undrawn
 
 FAST = ("plan.baselines=['none']", "prediction.store_hz=5")
 
@@ -98,3 +99,15 @@ def test_with_people_nearest_the_robot_heeds_one(pair: Path, tmp_path: Path) -> 
     assert "person" not in pq.read_schema(one / "state.parquet").names
     notes = json.loads((one / "run.json").read_text())["notes"]
     assert any("the robot does not react to it" in note for note in notes)
+
+
+def test_audit_judges_each_person_as_the_report_does(pair: Path, tmp_path: Path) -> None:
+    with undrawn():
+        folder = audit.run([pair], out=tmp_path / "audit", start_s=2.0)
+    found = json.loads((folder / "audit.json").read_text())
+    metrics = json.loads((pair / "metrics.json").read_text())
+    assert [log["log"] for log in found["logs"]] == ["pair, person 1", "pair, person 2"]
+    for k, log in enumerate(found["logs"], start=1):
+        whole = log["methods"]["sound"]["all"]["covered_share"]
+        assert whole["value"] == pytest.approx(metrics[f"person_{k}_volumes_full_held_share"]["value"])
+        assert whole["samples"] == metrics[f"person_{k}_volumes_full_checked_ticks"]["value"]
