@@ -351,7 +351,17 @@ _CHOSEN = -1
 
 
 def read_recording(log: Log, ticks_ns: Ints, fusion_stage: FusionStage, progress: Callable[[int], None]) -> Recording:
-    """Reads the recording of the nearest person alone; see ``read_recordings``."""
+    """Reads the recording of the nearest person alone; see ``read_recordings``.
+
+    Args:
+        log: Log to read.
+        ticks_ns: (n,) ticks of the span, increasing [ns].
+        fusion_stage: Cameras and settings of stage 1.
+        progress: Called with the number of ticks done since the last call.
+
+    Raises:
+        LogError: No camera saw a person.
+    """
     return read_recordings(log, ticks_ns, replace(fusion_stage, people="nearest"), progress)[1]
 
 
