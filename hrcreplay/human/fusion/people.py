@@ -72,6 +72,8 @@ class Tracked:
     shown_m: Floats | None = None  #: (20, 3) POINTS in it, world [m]
     walk: Floats | None = None  #: (2, 2) x, y and their velocities at the tick of the last frame [m, m/s]
     walk_ns: int = 0  #: that tick
+    p: Floats | None = None  #: (13,) JOINTS at the last tick [m, m, rad..., m]; None or NaN: not known
+    lengths: Floats | None = None  #: (7,) LENGTHS at the last tick [m]
     views: tuple[LastFrame, ...] = ()  #: of each camera that showed it
 
     def is_remembered(self, t_ns: int | Ints, memory_s: float) -> bool | Bools:
@@ -84,6 +86,22 @@ class PeopleState(NamedTuple):
 
     tracked: tuple[Tracked, ...]  #: in the order of their numbers
     spent: tuple[int, ...]  #: numbers of all people so far
+
+
+class Seen(NamedTuple):
+    """All bodies of a call, and when they arrived."""
+
+    measured: Measurements
+    bodies: Ints  #: (n,) the tracker's ids
+    until: Ints  #: (k,) row after the last one that arrived by each tick
+
+    def rows(self, tick: int) -> slice:
+        """Rows that arrived after the tick before and up to a tick."""
+        return slice(int(self.until[tick - 1]) if tick else 0, int(self.until[tick]))
+
+    def ticks(self) -> list[int]:
+        """Ticks of new frames."""
+        return [int(k) for k in np.flatnonzero(np.diff(self.until, prepend=0))]
 
 
 class Followed(NamedTuple):
@@ -134,16 +152,16 @@ def follow(
         ``person_frames_without`` (frames that show nobody), ``person_id_switches`` and ``bodies_seen_briefly`` (bodies
         that were never a person); and the trace of the rows of the states.
     """
-    last = np.searchsorted(measured.arrival_ns, ticks_ns, side="right")
-    first = np.concatenate([[0], last[:-1]])
-    begins = [int(k) for k in np.flatnonzero(last > first)]
+    seen = Seen(measured, bodies, np.searchsorted(measured.arrival_ns, ticks_ns, side="right"))
+    given = _follow_alone(state, ticks_ns, seen, rules, settings, limits, traced=traced)
+    if given is not None:
+        return given
     numbers, counts = np.zeros(len(measured), np.int64), Counter[str]()
     parts: list[tuple[HumanStates, Trace]] = []
-    edges = sorted({0, *begins, len(ticks_ns)})
+    edges = sorted({0, *seen.ticks(), len(ticks_ns)})
     for begin, end in pairwise(edges):
-        ticks = ticks_ns[begin:end]
-        rows = slice(int(first[begin]), int(last[begin]))
-        state = _assign(state, measured, bodies, rows, rules, numbers, counts)
+        ticks, rows = ticks_ns[begin:end], seen.rows(begin)
+        state = _assign(state, seen, rows, rules, numbers, counts)
         found, tracked = [], []
         for one in state.tracked:
             mine = rows.start + np.flatnonzero(numbers[rows] == one.number)
@@ -152,7 +170,7 @@ def follow(
             )
             counts.update(some)
             found.append((one, states, trace))
-            tracked.append(_move_on(replace(one, filter=after), states, seen=len(mine) > 0))
+            tracked.append(_move_on(replace(one, filter=after), states, 0, len(ticks), seen=len(mine) > 0))
         parts += _present(found, ticks, rules, settings)
         state = _forget(state._replace(tracked=tuple(tracked)), int(ticks[-1]), rules, settings, counts)
     states, trace = HumanStates.join([part for part, _ in parts]), Trace.join([part for _, part in parts])
@@ -162,11 +180,47 @@ def follow(
     return Followed(state, numbers, replace(states, person=None), +counts, trace)
 
 
-def _move_on(one: Tracked, states: HumanStates, *, seen: bool) -> Tracked:
-    """Notes position and velocity after the tick of a frame."""
-    if not seen or not np.isfinite(states.p[0, 0]):
+def _follow_alone(
+    state: PeopleState,
+    ticks_ns: Ints,
+    seen: Seen,
+    rules: PeopleRules,
+    settings: Fusion,
+    limits: LimitSet,
+    *,
+    traced: bool,
+) -> Followed | None:
+    """Follows one person with a single run of the filter; None if not all bodies are this person.
+
+    The filter runs as if they were. The assignment frame by frame, with its states, then shows whether that is so.
+    """
+    if len(state.tracked) != 1 or not state.tracked[0].is_person:
+        return None
+    one, numbers, counts = state.tracked[0], np.zeros(len(seen.measured), np.int64), Counter[str]()
+    after, states, found, trace = fuse.fuse(one.filter, ticks_ns, seen.measured, settings, limits, traced=traced)
+    counts.update(found)
+    edges = [*seen.ticks(), len(ticks_ns)]
+    state = state._replace(tracked=(_move_on(one, states, 0, edges[0], seen=False),))
+    for begin, end in pairwise(edges):
+        rows = seen.rows(begin)
+        state = _assign(state, seen, rows, rules, numbers, counts)
+        if len(state.tracked) > 1 or (numbers[rows] != one.number).any():
+            return None
+        state = state._replace(tracked=(_move_on(state.tracked[0], states, begin, end, seen=True),))
+    state = state._replace(tracked=(replace(state.tracked[0], filter=after),))
+    person = None if one.number == 1 else np.full(len(states), one.number)
+    return Followed(state, numbers, replace(states, person=person), +counts, trace)
+
+
+def _move_on(one: Tracked, states: HumanStates, begin: int, end: int, *, seen: bool) -> Tracked:
+    """Notes position and velocity at row ``begin``, the tick of a frame if ``seen``, and the posture at ``end`` - 1."""
+    if begin == end:
         return one
-    return replace(one, walk=np.stack([states.p[0, :2], states.v[0, :2]]), walk_ns=int(states.t_ns[0]))
+    one = replace(one, p=states.p[end - 1], lengths=states.lengths_m[end - 1])
+    if not seen or not np.isfinite(states.p[begin, 0]):
+        return one
+    walk = np.stack([states.p[begin, :2], states.v[begin, :2]])
+    return replace(one, walk=walk, walk_ns=int(states.t_ns[begin]))
 
 
 def _present(
@@ -219,15 +273,10 @@ def _forget(state: PeopleState, t_ns: int, rules: PeopleRules, settings: Fusion,
 
 
 def _assign(
-    state: PeopleState,
-    measured: Measurements,
-    bodies: Ints,
-    rows: slice,
-    rules: PeopleRules,
-    numbers: Ints,
-    counts: Counter[str],
+    state: PeopleState, seen: Seen, rows: slice, rules: PeopleRules, numbers: Ints, counts: Counter[str]
 ) -> PeopleState:
     """Assigns the bodies that arrived in one tick, frame after frame; writes their ``numbers``."""
+    measured, bodies = seen.measured, seen.bodies
     for frame in _by_frame(measured, rows):
         points_m = _shown(measured, frame)
         places_m = _places(points_m)
@@ -320,12 +369,11 @@ def _walked(one: Tracked, capture_ns: int) -> Floats:
 
 def _expected(one: Tracked, walked_m: Floats) -> Floats:
     """(20, 3) the points expected [m]: of the fused skeleton, else those last shown."""
-    estimate = one.filter.estimate
-    if one.walk is None or not estimate.started[0]:
+    if one.walk is None or one.p is None or one.lengths is None or np.isnan(one.p[0]):
         return np.asarray(one.shown_m)
-    p = estimate.mean[None, :, 0].copy()
+    p = one.p[None].copy()
     p[0, :2] = one.walk[0] + walked_m[:2]
-    return np.asarray(skeleton(p, estimate.lengths[None])[0])
+    return np.asarray(skeleton(p, one.lengths[None])[0])
 
 
 def _apart(points_m: Floats, expected_m: Floats, otherwise_m: Floats) -> Floats:

@@ -6,11 +6,12 @@ from collections import Counter
 from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
+from unittest import mock
 
 import numpy as np
 import pytest
 
-from hrcreplay.human.fusion import fuse
+from hrcreplay.human.fusion import fuse, people
 from hrcreplay.human.fusion.inverse_kinematics import measure
 from hrcreplay.human.fusion.people import PeopleRules, PeopleState, follow, start
 from hrcreplay.human.model import skeleton
@@ -134,6 +135,29 @@ def test_one_body_gives_the_states_of_the_filter_alone() -> None:
     assert found.states.p.tobytes() == states.p.tobytes()
     assert found.states.points_m.tobytes() == states.points_m.tobytes()
     assert +counts == Counter({name: n for name, n in found.counts.items() if name in counts})
+
+
+@pytest.mark.parametrize("jump", [False, True])
+def test_one_run_of_the_filter_has_the_bits_of_a_run_per_frame(jump: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    _, measured = crossing(1, "restart", swap_sides=False, until_s=3.0)
+    if jump:  # the person of the second half stands elsewhere: not one person all along
+        points = measured.points_m.copy()
+        points[len(points) // 2 :] += [3.0, 0.0, 0.0]
+        measured = replace(measured, points_m=points)
+    bodies, ticks_ns = np.ones(len(measured), np.int64), ticks_of(measured)
+    rules = PeopleRules(0.8, 2.0, POSES[:, :3, 3])
+    found = track(measured, bodies, rules, ticks_ns, batch=250)
+    with monkeypatch.context() as patch:
+        patch.setattr(people, "_follow_alone", lambda *_, **__: None)
+        expected = track(measured, bodies, rules, ticks_ns, batch=250)
+    with mock.patch.object(fuse, "fuse", wraps=fuse.fuse) as runs:
+        track(measured, bodies, rules, ticks_ns, batch=250)
+    assert (runs.call_count == -(-len(ticks_ns) // 250)) != jump  # one run a call, unless there is another person
+    assert found.counts == expected.counts
+    assert (found.numbers == expected.numbers).all()
+    for name, value in vars(expected.states).items():
+        same = getattr(found.states, name)
+        assert value.tobytes() == same.tobytes() if isinstance(value, np.ndarray) else value == same, name
 
 
 def test_one_person_before_two_cameras_is_one_person_and_a_body_shown_twice_too() -> None:
