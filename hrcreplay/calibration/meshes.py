@@ -8,6 +8,7 @@ from typing import Any
 
 import coal
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from hrcreplay.errors import SettingsError
 from hrcreplay.geometry.convex_hull import CORNERS, DIRECTIONS, around, hull
@@ -23,6 +24,8 @@ _PACKED = (b"PK", b"\x1f\x8b", b"\x28\xb5\x2f\xfd")
 CONVEX = 0.99
 #: Largest concavity of the parts of a decomposition: that of CoACD, relative to the size of the mesh.
 _CONCAVITY = 0.05
+#: Largest distance of a vertex from all parts of a decomposition, relative to the size of the mesh.
+_MISSED = 2e-3
 
 
 def read_parts(
@@ -106,6 +109,23 @@ def _decompose(vertices: Floats, triangles: Ints, at: str, most_parts: int) -> l
         raise SettingsError(
             f'{at}: if_concave = "decompose" needs CoACD; would be right: pip install "hrcreplay[meshes]"'
         ) from error
-    coacd.set_log_level("error")
+    if hasattr(coacd, "set_log_level"):
+        coacd.set_log_level("error")
     parts = coacd.run_coacd(coacd.Mesh(vertices, triangles), threshold=_CONCAVITY, max_convex_hull=most_parts, seed=0)
-    return [np.asarray(points, dtype=float) for points, _ in parts]
+    found = [np.asarray(points, dtype=float) for points, _ in parts]
+    outside = _outside(vertices, found)
+    if outside > _MISSED * float(np.ptp(vertices, axis=0).max()):
+        raise SettingsError(
+            f"{at}: file: the parts of its decomposition miss {outside:.3g} of it, in its units; would be right: "
+            'if_concave = "hull", or a mesh of convex parts in files of their own'
+        )
+    return found
+
+
+def _outside(vertices: Floats, parts: list[Floats]) -> float:
+    """How far a vertex lies outside all convex parts at most."""
+    least = np.full(len(vertices), np.inf)
+    for part in parts:
+        planes = ConvexHull(part).equations
+        least = np.minimum(least, (vertices @ planes[:, :3].T + planes[:, 3]).max(axis=1))
+    return float(least.max())

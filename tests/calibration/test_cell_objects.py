@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import struct
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import coal
 import numpy as np
@@ -221,3 +223,24 @@ def test_packed_and_unknown_files_are_refused(tmp_path: Path) -> None:
 def test_an_object_has_what_its_shape_needs() -> None:
     with pytest.raises(ValueError, match="no radius_m"):
         CellObject(name="a", shape="sphere")
+
+
+def test_a_decomposed_mesh_is_its_parts_and_may_miss_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, wide = (
+        obj(tmp_path / "ell.obj", *ell()),
+        [np.array([[x, y, z] for x in (0, 2) for y in (0, 1) for z in (0, 1)])],
+    )
+    tall = [np.array([[x, y, z] for x in (0, 1) for y in (0.5, 2) for z in (0, 1)])]
+    for parts in (wide + tall, wide):
+        made = [(points.astype(float), np.zeros((0, 3))) for points in parts]
+        fake = SimpleNamespace(Mesh=lambda *_: None, run_coacd=lambda *_, made=made, **__: made)
+        monkeypatch.setitem(sys.modules, "coacd", fake)
+        if len(parts) == 2:
+            found = read_parts(path, 0.1, "decompose", "cell", **MOST)
+            assert [ConvexHull(part).volume for part in found] == pytest.approx([0.002, 0.0015])
+        else:
+            with pytest.raises(SettingsError, match="miss 1 of it"):
+                read_parts(path, 0.1, "decompose", "cell", **MOST)
+    monkeypatch.setitem(sys.modules, "coacd", None)
+    with pytest.raises(SettingsError, match="CoACD"):
+        read_parts(path, 0.1, "decompose", "cell", **MOST)

@@ -103,11 +103,17 @@ def _by_program(controller: QpController, seen: Observation) -> tuple[Proposals,
     if controller.static is None:
         return proposals, found
     which, _, _ = plane_rows(controller.static, seen.sight.pose, 1.0)
-    return proposals, _with_planes_named(found, which, controller.static)
+    return proposals, name_planes(found, which, controller.static)
 
 
-def _with_planes_named(found: dict[str, Any], which: Ints, static: StaticObstacles) -> dict[str, Any]:
-    """Says of each row of a plane which link it keeps off which object or link."""
+def name_planes(found: dict[str, Any], which: Ints, static: StaticObstacles) -> dict[str, Any]:
+    """Says of each row of a plane which link it keeps off which object or link.
+
+    Args:
+        found: Result of ``find_holding_rows``.
+        which: (n, 4) of ``plane_rows``.
+        static: Objects of the cell and pairs of links.
+    """
     named = dict(found)
     for key in ("binding", "next", "conflict"):
         rows: list[dict[str, Any]] = []

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import coal
+import daqp
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 from scipy.spatial import Delaunay
 
 from hrcreplay.records import Floats
+from hrcreplay.robot.control.active_constraints import explain_refusal, find_holding_rows, name_planes
 from hrcreplay.robot.control.certificate import CLEAR, NO_PLANES, REFUSED, clear
-from hrcreplay.robot.control.control_step import at_rest
+from hrcreplay.robot.control.control_step import PlanSettings, Proposal, RobotState, at_rest, observe, stop_straight
+from hrcreplay.robot.control.minimiser import SLACK, Solution, minimise
+from hrcreplay.robot.control.qp_controller import QpContext, Target, problem, static_ahead_s
+from hrcreplay.robot.control.separation import Obstacles
 from hrcreplay.robot.control.static_obstacles import (
     ROWS_KEEP_M,
     StaticHull,
@@ -22,6 +27,7 @@ from hrcreplay.robot.control.static_obstacles import (
     static_obstacles,
 )
 from hrcreplay.robot.model import RobotModel, irb140
+from hrcreplay.settings.load import load_settings
 from tests.robot.distances import axis_distance
 from tests.tools.random_stops import DT_S, PAIRS, TOOL_M, Box, as_obstacles, as_static, random_boxes, run
 
@@ -39,10 +45,10 @@ def postures(robot: RobotModel, count: int, seed: int) -> list[tuple[Floats, Flo
     return [(rng.uniform(low, high), rng.normal(size=6)) for _ in range(count)]
 
 
-def floor(robot: RobotModel, height_m: float, clearance_m: float = 0.0) -> StaticObstacles:
+def floor(robot: RobotModel, height_m: float, clearance_m: float = 0.0, first: int = 0) -> StaticObstacles:
     hull = StaticHull("floor", half_space(robot, np.array([5.0, 2.0, height_m]), np.array([0.0, 0.0, 1.0])), 0.0)
-    keep_m = link_radii(robot)[:, None] + clearance_m
-    return static_obstacles(robot, [hull], keep_m, np.ones((5, 1), bool), np.empty((0, 2), np.int64), np.empty(0))
+    keep_m = np.where(np.arange(5)[:, None] >= first, link_radii(robot)[:, None] + clearance_m, -np.inf)
+    return static_obstacles(robot, [hull], keep_m, keep_m > 0.0, np.empty((0, 2), np.int64), np.empty(0))
 
 
 def test_the_box_of_a_half_space_holds_what_the_robot_reaches_behind_its_plane() -> None:
@@ -196,3 +202,72 @@ def test_coal_agrees_on_the_capsule_and_box_of_the_tool(robot: RobotModel) -> No
         capsule = coal.CollisionObject(coal.Capsule(radius, np.linalg.norm(b - a)), pose)
         least = min(least, coal.distance(capsule, shape, coal.DistanceRequest(), coal.DistanceResult()))
     assert low == pytest.approx(least, abs=1e-6)
+
+
+def _nobody() -> Obstacles:
+    return as_obstacles([Box(np.array([9.0, 0.0, 0.0]), np.eye(3), np.zeros(3), 0.1)])
+
+
+def _task(
+    robot: RobotModel, static: StaticObstacles, q: Floats, dq: Floats, rows: str
+) -> tuple[QpContext, PlanSettings]:
+    """A robot whose reference pulls its TCP down and sideways."""
+    plan = load_settings(None).plan.model_copy(update={"rows": rows, "jerk_s": 0.0})
+    settings, sight = PlanSettings(plan, dt_s=DT_S, stop_s=0.377), observe(robot, RobotState(q, dq), _nobody(), 0.0)
+    T = sight.pose.T_world_tcp.copy()
+    T[:3, 3] += [0.05, 0.1, -0.2]
+    target = Target(T, np.array([0.0, 0.2, -0.4, 0.0, 0.0, 0.0]), q)
+    return QpContext(robot, RobotState(q, dq), np.zeros(6), target, sight, _nobody(), 0.1, static), settings
+
+
+@pytest.mark.parametrize("rows", ["hard", "soft"])
+def test_the_minimiser_keeps_the_rows_of_planes_as_another_solver_does(robot: RobotModel, rows: str) -> None:
+    q = np.array([0.2, 0.6, -0.3, 0.1, 1.0, 0.0])
+    pose = robot.pose(q, np.zeros(6))
+    low = float((pose.ends_m[:, :, 2].min(axis=1) - link_radii(robot))[2:].min())
+    held = 0
+    for gap_m in (0.004, 0.01, 0.03, 0.3):
+        static = floor(robot, low - gap_m, first=2)
+        context, settings = _task(robot, static, q, np.zeros(6), rows)
+        task = problem(context, settings)
+        found = minimise(task)
+        assert isinstance(found, Solution)
+        _, A, high = plane_rows(static, pose, static_ahead_s(0.1, settings))
+        H, g = task.H, task.g
+        limits = np.vstack([np.eye(6), task.limits.J]), np.append(task.limits.high, task.limits.J_high)
+        below = np.append(task.limits.low, task.limits.J_low)
+        if rows == "soft":
+            H = np.block([[H, np.zeros((6, 1))], [np.zeros((1, 6)), np.array([[SLACK]])]])
+            g = np.append(g, 0.0)
+            limits = np.column_stack([limits[0], np.zeros(len(limits[0]))]), limits[1]
+            A = np.column_stack([A, -np.ones(len(A))])
+        whole = np.ascontiguousarray(np.vstack([limits[0], A]))
+        upper, lower = np.append(limits[1], high), np.append(below, np.full(len(A), -1e30))
+        x, _, flag, _ = daqp.solve(H.copy(), g.copy(), whole, upper, lower, np.zeros(len(upper), dtype=np.intc))
+        assert flag == 1
+        np.testing.assert_allclose(found.dq_next, x[:6], atol=2e-6)
+        assert found.held == (gap_m < 0.1)
+        held += found.held
+    assert held == 3
+
+
+def test_why_names_the_object_that_holds_the_robot(robot: RobotModel) -> None:
+    q = np.array([0.2, 0.6, -0.3, 0.1, 1.0, 0.0])
+    ends = robot.ends_m(q)
+    low = float((ends[:, :, 2].min(axis=1) - link_radii(robot))[2:].min())
+    static = floor(robot, low - 0.01, first=2)
+    context, settings = _task(robot, static, q, np.zeros(6), "soft")
+    task = problem(context, settings)
+    solved = minimise(task)
+    assert isinstance(solved, Solution)
+    which, _, _ = plane_rows(static, context.sight.pose, 1.0)
+    found = name_planes(find_holding_rows(task, solved), which, static)
+    (row,) = found["binding"]
+    link, end = divmod(int(np.argmin((ends[:, :, 2] - link_radii(robot)[:, None])[2:])) + 4, 2)
+    assert (row["kind"], row["object"], row["link"], row["end"]) == ("object", "floor", link, end)
+    assert row["multiplier"] > 0.0
+    stop = stop_straight(q, np.array([0.0, 1.5, 0.0, 0.0, 0.0, 0.0]), robot.ddq_max, DT_S)
+    told = explain_refusal(robot, at_rest(q), Proposal(stop, 0), _nobody(), 1.0, settings, static)
+    assert told["object"] == "floor"
+    assert robot.segments[told["link"]].name in {"wrist", "tool", "forearm"}
+    assert told["gap_m"] - told["travel_m"] <= 0.0
