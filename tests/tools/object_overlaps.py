@@ -180,7 +180,7 @@ def check(run_config: RunConfig, method: str = "qp", every: int = 1) -> Overlaps
     assert run_config.cell is not None
     brute = Brute(controller, shapes_of(run_config.cell.objects, robot.T_world_base), settings.robot.tool_m)
     forecast = Forecast(assembly.surroundings(run_config, robot), states)
-    for tick in range(len(states)):
+    for tick in range(len(forecast.t_ns)):
         before = controller.stop
         taken = controller.step(forecast.predict(tick))
         brute.look(taken.state.q[None])
