@@ -31,7 +31,7 @@ from hrcreplay.robot.model import RobotModel, RobotPose
 ROWS_KEEP_M = 2e-3
 
 #: There is no row between a link and an object that are further apart than this beyond the kept distance [m].
-ROWS_WITHIN_M = 1.0
+ROWS_WITHIN_M = 0.5
 
 #: Kept distance of a pair that is not checked [m].
 UNCHECKED = -math.inf
