@@ -192,6 +192,8 @@ def draw_outlines(ax: Axes, limbs: Mapping[str, SweptVolume], view: View) -> Non
 
 def draw_objects(ax: Axes, objects: Sequence[StaticHull], view: View) -> None:
     """Objects of the cell in pale grey behind all else."""
+    if not objects:
+        return  # an empty collection would change the bytes of figures without objects
     edges = [RenderedHull(one.vertices_m, one.radius_m, (0.0, 0.0, 0.0)).outline(view) for one in objects]
     polygons = PolyCollection([edge for edge in edges if len(edge)], facecolors=drawing.FAINT, zorder=-1)
     polygons.set(edgecolors=drawing.INK, alpha=0.25, linewidths=0.5)

@@ -32,7 +32,7 @@ def volumes(people: HumanStates, settings: Prediction) -> SweptVolumes:
 
 @pytest.mark.parametrize("method", ["sound", "paper"])
 def test_points_that_move_as_fast_as_people_stay_inside(method: str) -> None:
-    settings = Prediction(method=method, latency_s=0.03)  # type: ignore[arg-type]
+    settings = Prediction(method=method, latency_s=0.03)
     rng = np.random.default_rng(3)
     points = rng.uniform(-0.4, 0.4, (20, 3)) + np.array([2.0, 1.0, 1.1])
     found = volumes(seen(points), settings).at(1)

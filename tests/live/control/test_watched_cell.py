@@ -122,7 +122,7 @@ def test_looks_at_the_area_are_the_replay_tick_by_tick(cell: Path) -> None:
     _, seen = fusion_stage.measure(frames, PersonMemory())
     live = HumanStates.join(flight.states)
     blank = replace(live, nobody_s=None, nobody_else_s=None)
-    _, again, counts = vacancy.watch(vacancy.start(2), blank, seen.everybody, seen.mine, fusion_stage.watched)
+    _, again, counts = vacancy.watch(vacancy.start(2), blank, seen.everybody, seen.person, fusion_stage.watched)
     assert live.nobody_s is not None
     assert again.nobody_s is not None
     assert len(np.unique(np.isfinite(live.nobody_s))) == 2

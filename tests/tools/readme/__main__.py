@@ -110,7 +110,10 @@ def _sources(measurement: Measurement) -> str:
     """Digest of the sources that a measurement rests on, the lock of their versions included."""
     package = ROOT / "hrcreplay"
     if measurement.sampled:
-        paths = [*(path for name in _SAMPLED for path in _files(package / name)), *_files(ROOT / "tests" / "tools" / "soundness")]
+        paths = [
+            *(path for name in _SAMPLED for path in _files(package / name)),
+            *_files(ROOT / "tests" / "tools" / "soundness"),
+        ]
     else:
         paths = [path for path in _files(package) if path.relative_to(package).parts[0] not in _LEFT_OUT]
         paths.append(ROOT / "datasets" / "demo.mcap")
