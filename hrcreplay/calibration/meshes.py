@@ -8,7 +8,7 @@ from typing import Any
 
 import coal
 import numpy as np
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, HalfspaceIntersection
 
 from hrcreplay.errors import SettingsError
 from hrcreplay.geometry.convex_hull import CORNERS, DIRECTIONS, around, hull
@@ -119,7 +119,14 @@ def _decompose(vertices: Floats, triangles: Ints, at: str, most_parts: int) -> l
             f"{at}: file: the parts of its decomposition miss {outside:.3g} of it, in its units; would be right: "
             'if_concave = "hull", or a mesh of convex parts in files of their own'
         )
-    return found
+    return [_grow(part, outside) for part in found] if outside > 0.0 else found
+
+
+def _grow(part: Floats, by: float) -> Floats:
+    """Corners of a convex part whose faces have moved outwards."""
+    planes = ConvexHull(part).equations
+    planes[:, 3] -= by
+    return np.asarray(HalfspaceIntersection(planes, part.mean(axis=0)).intersections)
 
 
 def _outside(vertices: Floats, parts: list[Floats]) -> float:

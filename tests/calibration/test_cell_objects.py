@@ -244,3 +244,15 @@ def test_a_decomposed_mesh_is_its_parts_and_may_miss_nothing(tmp_path: Path, mon
     monkeypatch.setitem(sys.modules, "coacd", None)
     with pytest.raises(SettingsError, match="CoACD"):
         read_parts(path, 0.1, "decompose", "cell", **MOST)
+
+
+def test_the_parts_of_a_decomposition_contain_every_corner_and_are_no_larger(tmp_path: Path) -> None:
+    vertices, triangles = ell()
+    parts = read_parts(obj(tmp_path / "ell.obj", vertices, triangles), 0.1, "decompose", "cell", **MOST)
+    planes = [ConvexHull(part).equations for part in parts]
+    outside = np.min([(0.1 * vertices @ p[:, :3].T + p[:, 3]).max(axis=1) for p in planes], axis=0)
+    assert len(parts) == 2
+    assert outside.max() < 1e-9
+    assert sum(ConvexHull(part).volume for part in parts) == pytest.approx(0.003, rel=0.02)
+    again = read_parts(tmp_path / "ell.obj", 0.1, "decompose", "cell", **MOST)
+    assert all(one.tobytes() == two.tobytes() for one, two in zip(parts, again, strict=True))

@@ -429,7 +429,6 @@ def test_trc_of_markers_on_the_skin(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("unit", ["mm", "m"])
 def test_c3d(unit: str, tmp_path: Path) -> None:
-    pytest.importorskip("ezc3d", reason="ezc3d reads C3D files and is not installed")
     motion = MOTION.copy()
     motion[7, at("wrist_r")] = np.nan
     writers.c3d(tmp_path / "a.c3d", list(POINTS), motion, unit=unit)
@@ -701,7 +700,6 @@ def test_reported_files_are_refused_with_the_reason(
 
 
 def test_reported_c3d_without_content_is_refused(tmp_path: Path) -> None:
-    pytest.importorskip("ezc3d", reason="ezc3d reads C3D files and is not installed")
     with pytest.raises(LogError, match=facts("walk.c3d", "C3D")):
         import_files("c3d", [str(data_path("reported/txt/walk.c3d"))], tmp_path / "a.mcap")
 
