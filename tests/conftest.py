@@ -113,11 +113,11 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 
 @pytest.fixture(scope="session")
 def demo_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A report on the shipped log, as ``hrcreplay report`` makes it by default."""
+    """A report on the shipped log with the objects of its cell, as ``hrcreplay demo`` makes it."""
     from hrcreplay.commands import replay
 
     out = tmp_path_factory.mktemp("demo") / "run"
-    return replay.run("report", replay.demo_log(), out=out)
+    return replay.run("report", replay.demo_log(), out=out, cell_file=replay.demo_cell())
 
 
 @pytest.fixture(scope="session")

@@ -122,6 +122,7 @@ class Loop:
     _stored_ns: int = 0
     _low_disk: bool = False
     _strangers: int = 0  # number of other senders that have been reported
+    _others: bool = False  # whether another body than the person has been reported
 
     def now_ns(self) -> int:
         """The session's clock [ns]: monotonic, and set to Unix time at the start."""
@@ -193,6 +194,7 @@ class Loop:
         perception = self.controller.update_perception(t_ns, skeletons)
         for skeleton in skeletons:
             self.recorder.send(codec.encode_skeleton(t_ns, skeleton))
+        self._tell_others()
         if perception is None:
             self.recorder.send(codec.encode_event(t_ns, {"what": "blind"}))
             return
@@ -230,6 +232,15 @@ class Loop:
             robot = self.link.robot
             why = f"live.robot_address is {robot}" if address != robot else "another port of the robot is answered"
             self.note(f"datagrams of {address}:{port} are not heard: {why}")
+
+    def _tell_others(self) -> None:
+        """Reports once that cameras show another body than the person whom the robot keeps clear of."""
+        if not self._others and self.controller.observer.counts["person_frames_beside_others"]:
+            self._others = True
+            self.note(
+                "cameras show another body than the person: a live session keeps clear of one person only, "
+                "the one nearest to the last position"
+            )
 
     def _signals(self) -> Signal:
         now_ns, found = self.now_ns(), self.caught
