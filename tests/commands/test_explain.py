@@ -328,9 +328,10 @@ def test_the_command_prints_the_cause_and_all_facts_as_json(demo_folder: Path, r
     assert [line.split(":")[0] for line in said[-2:]] == ["Camera kinect", "Camera xtion"]
     facts = json.loads(CliRunner().invoke(app, ["why", str(demo_folder), "--at", at, "--json"]).stdout)
     assert first <= facts["tick"] < past
-    state = pq.read_table(demo_folder / "state.parquet").to_pandas().iloc[: facts["tick"] + 1]
+    state = pq.read_table(demo_folder / "state.parquet").to_pandas()
     frames = pq.read_table(demo_folder / "measurements.parquet").to_pandas()
-    now_ns = int(state["t_ns"].iloc[-1])
+    now_ns = int(state["t_ns"].unique()[facts["tick"]])
+    state = state[state["t_ns"] <= now_ns]  # a row for each person at every tick
     for camera, ages in facts["cameras"].items():
         used_ns = int(state["t_ns"][state[f"valid_{camera}"]].iloc[-1])
         seen = frames[(frames["camera"] == camera) & (frames["arrival_ns"] <= now_ns)]

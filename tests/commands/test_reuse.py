@@ -150,6 +150,7 @@ STALE = {
 OTHER: dict[str, Any] = {
     "logs.topics": ("/camera/kinect/skeleton",),
     "logs.decoders": ({"topic": "/a", "camera": "a", "points": "p", "index": {"neck": 0}},),
+    "logs.people": "nearest",
     "logs.unit": "mm",
     "logs.marker_ids_per_body": 33,
     "logs.joints_topic": "/robot/joints",

@@ -183,7 +183,7 @@ def _not_finite(out: Path, made: Clip) -> list[str]:
     wrong = ["an infinite state"] if np.isinf(numbers).any() else []
     clean = [name for name in CAMERAS if name not in made.touched]
     seen = [name for name in clean if sum(frame.camera == name for frame in made.frames) >= _LEAST]
-    base = table[["x", "y", "theta", "rho"]].to_numpy()[-1]
-    if seen and not np.isfinite(base).all():
+    base = table.loc[table["t_ns"] == table["t_ns"].max(), ["x", "y", "theta", "rho"]].to_numpy()  # a row per person
+    if seen and not np.isfinite(base).all(axis=1).any():
         wrong.append(f"no state at the end although {seen} are as they were: {base}")
     return wrong

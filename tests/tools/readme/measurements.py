@@ -148,7 +148,7 @@ def measurements() -> list[Measurement]:
         _audit(f"audit excerpt, {name}", (f"{EXCERPT} {options}".strip(),), {}) for name, options in MARGINS.items()
     ]
     command = f"hrcreplay compare {DEMO} --out {{tmp}}/run"
-    found.append(Measurement("compare", (command,), "commands/compare.json", of_comparison, {}))
+    found.append(Measurement("compare", (command,), "run/compare.json", of_comparison, {}))
     found += [_recording(name, key) for name, key in RECORDINGS.items()]
     for (method, limits), samples in sorted(SAMPLES.items(), key=lambda item: item[1]):
         command = f"tests.tools.soundness --json --samples {samples} --method {method} --limits {limits}"
