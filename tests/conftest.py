@@ -46,7 +46,7 @@ QUICK = (
     *(f"tests/logs/test_{name}.py" for name in ("dirty", "importers", "info", "plausibility", "poses", "writer")),
     *(f"tests/reporting/test_{name}.py" for name in ("defect_notes", "golden", "limbs", "summary")),
 )
-WHOLE_RUNS = {"demo_folder", "printed"}
+WHOLE_RUNS = {"demo_folder", "demo_with_objects", "printed"}
 
 
 def group_of(nodeid: str) -> str:
@@ -113,10 +113,19 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 
 @pytest.fixture(scope="session")
 def demo_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A report on the shipped log with the objects of its cell, as ``hrcreplay demo`` makes it."""
+    """A report on the shipped log alone, as ``hrcreplay report`` makes it by default."""
     from hrcreplay.commands import replay
 
     out = tmp_path_factory.mktemp("demo") / "run"
+    return replay.run("report", replay.demo_log(), out=out)
+
+
+@pytest.fixture(scope="session")
+def demo_with_objects(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A report on the shipped log with the objects of its cell, as ``hrcreplay demo`` makes it."""
+    from hrcreplay.commands import replay
+
+    out = tmp_path_factory.mktemp("objects") / "run"
     return replay.run("report", replay.demo_log(), out=out, cell_file=replay.demo_cell())
 
 

@@ -75,8 +75,8 @@ def _same(name: str, found: dict[str, Any]) -> None:
         assert stated[key] == (value if value is None else pytest.approx(value, rel=1e-6)), key
 
 
-def test_the_demo_by_default(demo_folder: Path) -> None:
-    _same("demo", of_report(json.loads((demo_folder / "metrics.json").read_text())))
+def test_the_demo_by_default(demo_with_objects: Path) -> None:
+    _same("demo", of_report(json.loads((demo_with_objects / "metrics.json").read_text())))
 
 
 def test_the_demo_as_printed(printed: Run) -> None:
