@@ -74,6 +74,9 @@ NOBODY = -1
 #: Name of the border of a watched area among the volumes that a robot keeps clear of; all sides have this name.
 BORDER = "BORDER"
 
+#: Between a limb and its person in the name of a limb or volume of person 2, 3, ...
+OF_PERSON = " of person "
+
 #: Name of the motion of the robot as recorded, among the methods; it is no controller.
 RECORDED = "recorded"
 #: Methods whose motion rests on no volume: the programme without reaction, and the robot as recorded.

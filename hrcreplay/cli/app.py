@@ -224,6 +224,21 @@ def report(
             help="With a run folder: only write a still of its replay at that instant, PNG; --out names the file.",
         ),
     ] = None,
+    movie: Annotated[
+        bool,
+        typer.Option(
+            "--movie",
+            help="With a run folder: only write ten seconds of its worst moments, MP4 (needs ffmpeg) or GIF; "
+            "--out names the file.",
+        ),
+    ] = False,
+    rerun: Annotated[
+        bool,
+        typer.Option(
+            "--rerun",
+            help="With a run folder: only write its scene for the Rerun viewer (extra: rerun); --out names the file.",
+        ),
+    ] = False,
     figure: Annotated[
         str | None,
         typer.Option(
@@ -238,8 +253,8 @@ def report(
     ] = False,
 ) -> None:
     """All stages, then metrics.json, figures, report.html with the 3-D replay, and scene.mcap."""
-    if list_figures or source is None or figure is not None or snapshot is not None:
-        _part_of_report(source, figure, snapshot, out, listed=list_figures)
+    if list_figures or source is None or figure is not None or snapshot is not None or movie or rerun:
+        _part_of_report(source, figure, snapshot, out, listed=list_figures, movie=movie, rerun=rerun)
         return
     folder = _run(
         "report",
@@ -256,10 +271,17 @@ def report(
 
 
 def _part_of_report(
-    source: Path | None, figure: str | None, snapshot: float | None, out: Path | None, *, listed: bool
+    source: Path | None,
+    figure: str | None,
+    snapshot: float | None,
+    out: Path | None,
+    *,
+    listed: bool,
+    movie: bool,
+    rerun: bool,
 ) -> None:
     """Writes single parts of a report from a run folder, without a new run folder."""
-    from hrcreplay.commands.report import draw_figures, list_figures, take_still
+    from hrcreplay.commands.report import draw_figures, list_figures, make_movie, save_for_rerun, take_still
 
     if listed:
         found: list[object] = [*list_figures(source)]
@@ -267,6 +289,10 @@ def _part_of_report(
         raise SettingsError("report: found neither log nor run folder; give one: hrcreplay report LOG_OR_RUN")
     elif figure is not None:
         found = [*draw_figures(source, figure, out)]
+    elif movie:
+        found = [make_movie(source, out)]
+    elif rerun:
+        found = [save_for_rerun(source, out)]
     else:
         found = [take_still(source, snapshot or 0.0, out)]
     sys.stdout.write("".join(f"{line}\n" for line in found))

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
-
-import pandas as pd
 
 from hrcreplay.commands.explain import Record, stop_table
 from hrcreplay.errors import SettingsError
@@ -17,6 +15,7 @@ from hrcreplay.human.model import PARTS, part_radii
 from hrcreplay.logs.reader import Log
 from hrcreplay.pipeline import assembly
 from hrcreplay.pipeline.run_config import RunConfig, read_run_config
+from hrcreplay.records import Floats
 from hrcreplay.reporting import tables
 from hrcreplay.reporting.figures import catalogue, drawing
 from hrcreplay.reporting.figures.catalogue import FigureData, FigureKind
@@ -26,10 +25,11 @@ from hrcreplay.reporting.metrics.fusion import add_fusion, add_limbs, add_occupa
 from hrcreplay.reporting.metrics.people import add_people
 from hrcreplay.reporting.metrics.planning import add_plan
 from hrcreplay.reporting.metrics.series import Metric, MetricTable, start_ns
+from hrcreplay.reporting.movie import default_name, write_movie
 from hrcreplay.reporting.page import report_page
 from hrcreplay.reporting.page.replay_page import snapshot
 from hrcreplay.reporting.replay_scene import ReplayScene, replay_scene
-from hrcreplay.reporting.scene_mcap import write_scene
+from hrcreplay.reporting.scene_mcap import foxglove_layout, write_scene
 from hrcreplay.reporting.summary_text import lines
 from hrcreplay.reporting.tables import PageTable
 from hrcreplay.settings.sections import Logs, setting
@@ -38,7 +38,7 @@ from hrcreplay.store.run_folder import Run, RunWriter
 
 
 def write_report(run_config: RunConfig, writer: RunWriter, meta: dict[str, Any], log: Log | None = None) -> None:
-    """Writes metrics.json, the figures, report.html and scene.mcap beside the tables that have just been written.
+    """Writes metrics.json, the figures, report.html, scene.mcap and its layout beside the tables that have just been written.
 
     Args:
         run_config: The run.
@@ -47,6 +47,7 @@ def write_report(run_config: RunConfig, writer: RunWriter, meta: dict[str, Any],
         log: Log of a replay, whose ticks can be computed again; None for a live session.
     """
     near = _bounds(run_config.settings.model_dump())
+    meta["cameras"] = {name: T.tolist() for name, T in sorted(_camera_poses(run_config, log).items())}
     everybody = run_folder.read(writer.partial, meta, shown=True)
     found = compute(everybody, **near)
     run = everybody.of_person(everybody.people[0])
@@ -59,16 +60,44 @@ def write_report(run_config: RunConfig, writer: RunWriter, meta: dict[str, Any],
     if prediction_stage.method == "sound" and prediction.legs:
         radii["legs, of sound"] = prediction.legs_radius_m
     folder = writer.partial / "figures"
-    catalogue.draw_all(figure_data(run_config, run, found, catalogue.select_figures(run, found)), folder)
+    _draw_figures(run_config, everybody, found, catalogue.select_figures(run, found), folder)
     shown = [
         tables.limit_table(run_config.prediction_limits, use="prediction"),
         tables.limit_table(run_config.tracking_limits, use="tracking"),
         tables.radius_table(radii),
     ]
     scene = scene_of(run_config, everybody)
-    writer.text("report.html", report_page.render(run, found, folder, shown, stops=stops, scene=scene))
+    writer.text(
+        "report.html", report_page.render(run, found, folder, shown, stops=stops, scene=scene, people=everybody.people)
+    )
     if scene is not None:
-        write_scene(writer.partial / "scene.mcap", scene, run.measurements)
+        write_scene(writer.partial / "scene.mcap", scene, everybody.measurements)
+        writer.text("foxglove-layout.json", foxglove_layout())
+
+
+def _camera_poses(run_config: RunConfig, log: Log | None) -> dict[str, Floats]:
+    """Returns the pose (4, 4) of each camera in the world, as the cell file or the log has it."""
+    known = {} if run_config.cell is None else dict(run_config.cell.T_world_camera)
+    if log is None:
+        return known
+    poses = {**log.header.poses_beside(known)[0], **known}
+    return {name: poses[name] for name in log.header.cameras if name in poses}
+
+
+def _draw_figures(
+    run_config: RunConfig, everybody: Run, metrics: Mapping[str, Metric], kinds: Sequence[FigureKind], folder: Path
+) -> list[str]:
+    """Draws figures of a run with all its people; those of one person for each, where they are made for that.
+
+    Returns:
+        The names drawn.
+    """
+    drawn: list[str] = []
+    for number in everybody.people:
+        chosen = [kind for kind in kinds if number == everybody.people[0] or kind.each]
+        data = figure_data(run_config, everybody, metrics, chosen, number)
+        drawn += catalogue.draw_all(data, folder, chosen, number)
+    return drawn
 
 
 def scene_of(run_config: RunConfig, run: Run) -> ReplayScene | None:
@@ -78,16 +107,7 @@ def scene_of(run_config: RunConfig, run: Run) -> ReplayScene | None:
     radii_m = part_radii(run_config.settings.prediction, run_config.settings.report.leg_radius_m)
     parts = dict(zip(PARTS, radii_m.tolist(), strict=True))
     robot = assembly.robot(run_config, run.T_world_base)
-    one = run.of_person(run.people[0])
-    if run.occupancy is not None and "person" in run.occupancy:
-        one = replace(one, occupancy=_named_volumes(run.occupancy))
-    return replay_scene(one, robot, start_ns(one), parts, assembly.bounded_hulls(run_config, robot))
-
-
-def _named_volumes(occupancy: pd.DataFrame) -> pd.DataFrame:
-    """The volumes of all people, each limb named with its person."""
-    pairs = zip(occupancy["limb"].astype(str), occupancy["person"].tolist(), strict=True)
-    return occupancy.assign(limb=[assembly.of_person(limb, number) for limb, number in pairs])
+    return replay_scene(run, robot, start_ns(run), parts, assembly.bounded_hulls(run_config, robot))
 
 
 def _stops(
@@ -180,12 +200,7 @@ def take_still(folder: Path, at_s: float, out: Path | None) -> Path:
         SettingsError: The folder is not a run folder, the instant is outside the run, or the file exists or cannot be
             written.
     """
-    if not run_folder.is_run(folder):
-        raise SettingsError(f"--snapshot: {folder} is no run folder; make one with: hrcreplay report {folder}")
-    run = run_folder.read(folder)
-    scene = scene_of(read_run_config(folder), run)
-    if scene is None:
-        raise SettingsError(f"--snapshot: {folder} moved no robot; make a report of it first")
+    scene = _read_scene(folder, "--snapshot")[1]
     first, last = scene.seconds[[0, -1]].tolist()
     if not first <= at_s <= last:
         raise SettingsError(f"--snapshot {at_s:g}: found an instant outside the run; from {first:g} to {last:g} s")
@@ -198,19 +213,82 @@ def take_still(folder: Path, at_s: float, out: Path | None) -> Path:
     return path
 
 
+def make_movie(folder: Path, out: Path | None) -> Path:
+    """Writes the tour of a run's worst moments as a moving picture.
+
+    Args:
+        folder: Folder of a run with a robot.
+        out: MP4 or GIF to create; None: ``tour.mp4``, or ``tour.gif`` without ffmpeg, in the working directory.
+
+    Raises:
+        SettingsError: The folder is not a run folder, the file exists or cannot be written, or ffmpeg is needed and
+            missing.
+    """
+    path = out or Path(default_name())
+    with _new_file(path) as made:
+        write_movie(made, _read_scene(folder, "--movie")[1])
+    return path
+
+
+def save_for_rerun(folder: Path, out: Path | None) -> Path:
+    """Writes the scene of a run for the Rerun viewer.
+
+    Args:
+        folder: Folder of a run with a robot.
+        out: File to create; None: ``scene.rrd`` in the working directory.
+
+    Raises:
+        SettingsError: The folder is not a run folder, the file exists or cannot be written, or rerun-sdk is missing.
+    """
+    from hrcreplay.reporting.scene_rerun import write_scene as write_for_rerun  # rerun-sdk is an extra
+
+    path = out or Path("scene.rrd")
+    run, scene = _read_scene(folder, "--rerun")
+    with _new_file(path) as made:
+        write_for_rerun(made, scene, run.measurements, run.folder.name)
+    return path
+
+
+@contextmanager
+def _new_file(path: Path) -> Iterator[Path]:
+    """Gives a temporary name for a new file, which is renamed when it is complete."""
+    if path.exists():
+        raise SettingsError(f"{path}: exists already; name another file with --out, or remove it")
+    try:
+        with tempfile.TemporaryDirectory(prefix=".hrcreplay-", dir=path.parent) as folder:
+            made = Path(folder) / path.name
+            yield made
+            made.rename(path)
+    except OSError as error:
+        raise SettingsError(f"{path}: cannot be written ({error.strerror}); name a folder that can") from error
+
+
+def _read_scene(folder: Path, option: str) -> tuple[Run, ReplayScene]:
+    """Returns the tables and the scene of a run folder."""
+    if not run_folder.is_run(folder):
+        raise SettingsError(f"{option}: {folder} is no run folder; make one with: hrcreplay report {folder}")
+    run = run_folder.read(folder)
+    scene = scene_of(read_run_config(folder), run)
+    if scene is None:
+        raise SettingsError(f"{option}: {folder} moved no robot; make a report of it first")
+    return run, scene
+
+
 def figure_data(
-    run_config: RunConfig, run: Run, metrics: Mapping[str, Metric], kinds: Sequence[FigureKind]
+    run_config: RunConfig, everybody: Run, metrics: Mapping[str, Metric], kinds: Sequence[FigureKind], number: int = 1
 ) -> FigureData:
     """Returns all data from which some figures of a run are drawn.
 
     Args:
         run_config: Configuration of the run.
-        run: The run's tables.
+        everybody: The run's tables, with all people.
         metrics: The run's metrics.
         kinds: The figures.
+        number: The person of the figures that show one.
     """
-    predicted = compute_fields(run_config, run, [kind.predicted for kind in kinds])
-    return FigureData(run=run, metrics=metrics, **_bounds(run_config.settings.model_dump()), **predicted)
+    predicted = compute_fields(run_config, everybody, number, [kind.predicted for kind in kinds])
+    bounds = _bounds(run_config.settings.model_dump())
+    return FigureData(everybody.of_person(number), metrics, **bounds, **predicted, everybody=everybody)
 
 
 def draw_figures(folder: Path, key: str, out: Path | None) -> list[Path]:
@@ -232,18 +310,23 @@ def draw_figures(folder: Path, key: str, out: Path | None) -> list[Path]:
     if not kinds:
         there = ", ".join(map(catalogue.label, catalogue.FIGURES))
         raise SettingsError(f"--figure {key}: no such figure; there are {there}")
-    run, metrics = _recorded(folder, "--figure")
+    everybody, metrics = _recorded(folder, "--figure")
+    run = everybody.of_person(everybody.people[0])
     for kind in kinds:
         if why := catalogue.missing(kind, run, metrics):
             raise SettingsError(f"--figure {key}: {folder} lacks what it needs: {why}")
     to = out or Path()
-    paths = [to / f"{kind.name}.{suffix}" for kind in kinds for suffix in ("png", "svg")]
+    names = [
+        catalogue.file_name(kind, number)
+        for kind in kinds
+        for number in (everybody.people if kind.each else everybody.people[:1])
+    ]
+    paths = [to / f"{name}.{suffix}" for name in names for suffix in ("png", "svg")]
     if taken := [path for path in paths if path.exists()]:
         raise SettingsError(f"{taken[0]}: exists already; name another folder with --out, or remove it")
-    data = figure_data(read_run_config(folder), run, metrics, kinds)
     with tempfile.TemporaryDirectory() as made:
-        drawn = catalogue.draw_all(data, Path(made), kinds)
-        if len(drawn) < len(kinds):
+        drawn = _draw_figures(read_run_config(folder), everybody, metrics, kinds, Path(made))
+        if len(drawn) < len(names):
             raise SettingsError(
                 f"--figure {key}: {folder} lacks what it needs: the person was not known well enough then"
             )
@@ -258,7 +341,7 @@ def draw_figures(folder: Path, key: str, out: Path | None) -> list[Path]:
 
 def list_figures(folder: Path | None) -> list[str]:
     """Lists the figures, one per line: number or name, title and, for a run folder, any missing data."""
-    run = None if folder is None else _recorded(folder, "--list-figures")
+    run = None if folder is None else _of_first(*_recorded(folder, "--list-figures"))
     lines = []
     for kind in catalogue.FIGURES:
         why = "" if run is None else catalogue.missing(kind, *run)
@@ -276,4 +359,8 @@ def _recorded(folder: Path, option: str) -> tuple[Run, dict[str, Metric]]:
         raise SettingsError(f"{option}: {folder} is no run of fuse, predict, plan, report or live")
     path = folder / "metrics.json"
     metrics = json.loads(path.read_text()) if path.exists() else compute(run, **_bounds(run.meta["settings"]))
+    return run, metrics
+
+
+def _of_first(run: Run, metrics: dict[str, Metric]) -> tuple[Run, dict[str, Metric]]:
     return run.of_person(run.people[0]), metrics

@@ -106,14 +106,21 @@ def write_contact(run_config: RunConfig, log: Log, writer: RunWriter, T_world_ba
                 compute_full_coverage(run_config, people, predicted),
             )
             shown_ns = motion["t_ns"].to_numpy()[:: max(1, round(run_config.settings.fusion.rate_hz / _BODY_HZ))]
-            axes_m = body_axes(people.people[0].tracks, shown_ns, run_config.settings.prediction.hand_m)
-            writer.table("body", body_columns(shown_ns, axes_m, PARTS))
+            writer.table("body", body_table(people, shown_ns, run_config.settings.prediction.hand_m))
         capsules = None
         if method == RECORDED and motion["q1"].isna().all():
             capsules, _ = assembly.recorded_capsules(log, T_world_base)
         rows = contact_table(run_config, robot, method, motion, people, predicted, own, full, capsules)
         writer.table("contact", rows)
     writer.close_tables()
+
+
+def body_table(people: RecordedPeople, at_ns: Ints, hand_m: float) -> Columns:
+    """Returns the columns of body.parquet: the capsules of every person at each instant, in order of time."""
+    numbers = [one.number for one in people.people]
+    each = np.stack([body_axes(one.tracks, at_ns, hand_m) for one in people.people], axis=1)
+    person = None if numbers == [1] else np.tile(np.array(numbers, dtype=np.int64), len(at_ns))
+    return body_columns(np.repeat(at_ns, len(numbers)), each.reshape(-1, *each.shape[2:]), PARTS, person)
 
 
 def body_axes(person: Sequence[BodyTrack], at_ns: Ints, hand_m: float) -> Floats:

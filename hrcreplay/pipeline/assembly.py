@@ -30,6 +30,7 @@ from hrcreplay.pipeline.run_config import RunConfig, UrdfFiles, link_capsules
 from hrcreplay.records import (
     BORDER,
     NOBODY,
+    OF_PERSON,
     RECORDED,
     UNGUARDED,
     AxisFrame,
@@ -249,7 +250,7 @@ class Surroundings:
 
 def of_person(limb: str, number: int) -> str:
     """Name of a limb of a person; that of person 1 is the limb's own."""
-    return limb if number == 1 else f"{limb} of person {number}"
+    return limb if number == 1 else f"{limb}{OF_PERSON}{number}"
 
 
 @dataclass

@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
 
 from hrcreplay.human.model import skeleton
+from hrcreplay.pipeline.assembly import of_person
 from hrcreplay.records import JOINTS, LENGTHS, POINTS, RECORDED, Bools, Floats, Ints
 from hrcreplay.reporting.figures.drawing import BONES
 from hrcreplay.reporting.metrics.contact import StopEvent, method_prefixes, motion_of, stop_events
+from hrcreplay.reporting.metrics.people import named_volumes
 from hrcreplay.reporting.metrics.planning import numeric_column
 from hrcreplay.reporting.metrics.series import seconds_from, times
+from hrcreplay.reporting.robot_description import root_of, with_capsules
+from hrcreplay.robot import irb140, irb140_shape
 from hrcreplay.robot.control.control_step import stop_axis_by_axis
 from hrcreplay.robot.control.static_obstacles import StaticHull
-from hrcreplay.robot.model import RobotModel
+from hrcreplay.robot.irb140_shape import Solid
+from hrcreplay.robot.model import RobotModel, Segment
 from hrcreplay.settings.sections import setting
 from hrcreplay.store.run_folder import Run
 
@@ -27,17 +33,20 @@ RATE_HZ = 25.0
 VOLUME_HZ = 12.5
 #: Maximum age of a row of a table at an instant [s].
 _STALE_S = 0.2
-#: Shown body points of the fused person.
+#: Shown body points of a fused person.
 SHOWN_POINTS = tuple(dict.fromkeys(name for bone in BONES for name in bone))
+#: Lines between them.
+_PAIRS = np.array([[SHOWN_POINTS.index(a), SHOWN_POINTS.index(b)] for a, b in BONES])
 
 
 @dataclass(frozen=True)
 class LinkMesh:
-    """The surface of a link in the world, with all axes at zero."""
+    """The surface of a body of the robot in the world, with all axes at zero."""
 
-    link: int  #: index of the robot's link
+    link: int  #: index of the robot's link whose capsule surrounds it; -1: none
     vertices_m: Floats  #: (k, 3)
     triangles: Ints  #: (t, 3) indices of vertices
+    axes: int = -1  #: number of axes, counted from the base, that move it; -1: those of its link
 
 
 @dataclass(frozen=True)
@@ -51,7 +60,44 @@ class RobotGeometry:
     screws: Floats  #: (nv, 6) screws of unit rates: velocity of the point at the world's origin, angular velocity
     tcp_m: Floats  #: (3,)
     base_m: Floats  #: (3,)
-    meshes: tuple[LinkMesh, ...]  #: meshes of the links that have one
+    meshes: tuple[LinkMesh, ...]  #: meshes of the links that have one, and of the base
+    solids: tuple[Solid, ...] = ()  #: convex parts of these meshes in the world, if they are known
+    urdf: str = ""  #: text to draw it from
+    joints: tuple[str, ...] = ()  #: (nv,) names of its axes there
+    root: str = ""  #: its root link there
+    T_world_root: Floats = field(default_factory=lambda: np.eye(4))  #: (4, 4) pose of that link
+
+    def axes_of(self, mesh: LinkMesh) -> int:
+        """Number of axes that move a mesh."""
+        return int(self.moved_by[mesh.link]) if mesh.axes < 0 else mesh.axes
+
+
+class CameraSight(NamedTuple):
+    """A camera and the pyramid that it sees, as far as it is drawn."""
+
+    name: str
+    T_world_camera: Floats  #: (4, 4) z forward
+    half_view: tuple[float, float]  #: tangents of half of the field of view, across and down
+    known: bool  #: False: nothing states the field of view, and a usual one is drawn
+
+    def corners_m(self, depth_m: float) -> Floats:
+        """(5, 3) the camera and the corners of its view at a depth along its axis [m], world [m]."""
+        across, down = self.half_view
+        corners = [[0.0, 0.0, 0.0], *([s * across, t * down, 1.0] for s, t in ((-1, -1), (1, -1), (1, 1), (-1, 1)))]
+        return depth_m * np.array(corners) @ self.T_world_camera[:3, :3].T + self.T_world_camera[:3, 3]
+
+
+#: Drawn where nothing states the field of view, across and down [deg]; that of a usual depth camera.
+_USUAL_VIEW_DEG = (58.0, 45.0)
+
+
+def camera_sights(meta: Mapping[str, Any]) -> Iterator[CameraSight]:
+    """Yields the cameras that run.json knows the poses of."""
+    views = (meta.get("cell") or {}).get("views") or {}
+    for name, T in sorted((meta.get("cameras") or {}).items()):
+        fov_deg = (views.get(name) or {}).get("fov_deg")
+        half = np.tan(0.5 * np.radians(fov_deg or _USUAL_VIEW_DEG)).tolist()
+        yield CameraSight(name, np.array(T), (half[0], half[1]), fov_deg is not None)
 
 
 @dataclass(frozen=True)
@@ -105,15 +151,22 @@ class ReplayScene:
 
     t0_ns: int  #: instant of time zero of the report
     t_ns: Ints  #: (n,)
-    points_m: Floats  #: (n, len(SHOWN_POINTS), 3) the fused person
-    body_m: Floats  #: (n, p, 2, 3) ends of the recorded body's capsules; p is 0 without a comparison
-    body_parts: tuple[str, ...]  #: (p,)
+    points_m: Floats  #: (n, k * len(SHOWN_POINTS), 3) the fused people, one after the other
+    body_m: Floats  #: (n, p, 2, 3) ends of the capsules of all recorded bodies; p is 0 without a comparison
+    body_parts: tuple[str, ...]  #: (p,) named with the person
     body_radius_m: Floats  #: (p,)
     volumes: VolumeTrack
     robot: RobotGeometry
     methods: dict[str, MethodTrack]  #: the run's own first
     watched_m: Floats  #: (k, 2) corners of the watched area, on the floor; k is 0 if the cell gives none
     objects: tuple[StaticHull, ...] = ()  #: convex parts of the objects of the cell, without half-spaces
+    people: tuple[int, ...] = (1,)  #: (k,) numbers of the people
+    cameras: tuple[CameraSight, ...] = ()
+
+    @property
+    def bones(self) -> Ints:
+        """(b, 2) lines of the skeletons of all people, as indices of points."""
+        return np.concatenate([_PAIRS + k * len(SHOWN_POINTS) for k in range(len(self.people))])
 
     @property
     def seconds(self) -> Floats:
@@ -121,12 +174,19 @@ class ReplayScene:
         return seconds_from(self.t_ns, self.t0_ns)
 
 
-def robot_geometry(robot: RobotModel) -> RobotGeometry:
-    """Makes a robot with all axes at zero. A link's twist at unit velocity of an axis is the axis' screw, or zero."""
+def robot_geometry(robot: RobotModel, urdf: str | None = None) -> RobotGeometry:
+    """Makes a robot with all axes at zero. A link's twist at unit velocity of an axis is the axis' screw, or zero.
+
+    Args:
+        robot: The robot.
+        urdf: Text that it was made of; None: this project's IRB 140.
+    """
     zero = np.zeros((robot.nv, robot.nv))
     motion = robot.link_motion(zero, np.eye(robot.nv))
     moves = np.abs(motion.twist[:, :, 3:]).sum(axis=2) > 0.0  # (nv, s)
-    screws = motion.twist[np.arange(robot.nv), np.argmax(moves, axis=1)]
+    urdf = irb140.urdf() if urdf is None else urdf
+    root, T_root_base = root_of(urdf, robot.base_frame)
+    screws, look = motion.twist[np.arange(robot.nv), np.argmax(moves, axis=1)], own_look(robot)
     return RobotGeometry(
         links=tuple(segment.name for segment in robot.segments),
         radius_m=np.array([segment.radius_m for segment in robot.segments]),
@@ -135,8 +195,38 @@ def robot_geometry(robot: RobotModel) -> RobotGeometry:
         screws=screws,
         tcp_m=robot.pose(zero[0], zero[0]).T_world_tcp[:3, 3],
         base_m=robot.T_world_base[:3, 3],
-        meshes=tuple(_meshes(robot, motion.ends_m[0, :, 0], zero[0])),
+        meshes=own_meshes(look) if look else tuple(_meshes(robot, motion.ends_m[0, :, 0], zero[0])),
+        solids=look,
+        urdf=with_capsules(urdf, robot.segments),
+        joints=robot.joint_names,
+        root=root,
+        T_world_root=robot.T_world_base @ np.linalg.inv(T_root_base),
     )
+
+
+#: Number of axes that move a body of the IRB 140 -> its link whose capsule surrounds it.
+_LINK_AROUND = {1: 0, 2: 1, 3: 2, 5: 3}
+
+
+def own_look(robot: RobotModel) -> tuple[Solid, ...]:
+    """Returns the solids of this project's IRB 140 in the world, with all axes at zero; none of another robot."""
+    own = tuple(Segment(*capsule) for capsule in irb140.capsules(0.0)[:-1])
+    if robot.name != "irb140" or robot.segments[: len(own)] != own:
+        return ()
+    R, p = robot.T_world_base[:3, :3], robot.T_world_base[:3, 3]
+    return tuple(one._replace(vertices_m=one.vertices_m @ R.T + p) for one in irb140_shape.solids())
+
+
+def own_meshes(look: Sequence[Solid]) -> tuple[LinkMesh, ...]:
+    """Returns solids as one mesh for each body of the IRB 140."""
+    meshes = []
+    for axes in sorted({one.axes for one in look}):
+        parts = [one for one in look if one.axes == axes]
+        first = np.cumsum([0, *(len(one.vertices_m) for one in parts)])
+        triangles = np.concatenate([one.triangles + k for one, k in zip(parts, first, strict=False)])
+        vertices_m = np.concatenate([one.vertices_m for one in parts])
+        meshes.append(LinkMesh(_LINK_AROUND.get(axes, -1), vertices_m, triangles, axes))
+    return tuple(meshes)
 
 
 #: Maximum number of triangles of a drawn mesh; larger meshes are simplified.
@@ -212,10 +302,10 @@ def replay_scene(
     """Makes the replay of a run with a robot; None for other runs.
 
     Args:
-        run: The run's tables.
+        run: The run's tables, with all people.
         robot: The robot of the run at its base pose.
         t0_ns: Instant of time zero of the report [ns].
-        radii_m: Part of the recorded body -> radius of its capsule [m].
+        radii_m: Part of a recorded body -> radius of its capsule [m].
         objects: Convex parts of the objects of the cell, without half-spaces.
     """
     if run.motion is None or len(run.motion) < 2 or "q1" not in run.motion:
@@ -229,18 +319,21 @@ def replay_scene(
     if RECORDED in tables and not tables[RECORDED]["q1"].notna().any():  # its joints are not recorded
         del tables[RECORDED]
     slow = float(setting(run.meta.get("settings", {}), "report", "stationary_m_per_s"))
+    each = [run.of_person(number) for number in run.people]
     return ReplayScene(
         t0_ns=t0_ns,
         t_ns=t_ns,
-        points_m=_fused(run.state, t_ns),
-        body_m=_body(run.body, parts, t_ns),
-        body_parts=parts,
-        body_radius_m=np.array([radii_m[part] for part in parts]),
-        volumes=volume_track(run.occupancy),
-        robot=robot_geometry(robot),
+        points_m=np.concatenate([_fused(one.state, t_ns) for one in each], axis=1),
+        body_m=np.concatenate([_body(one.body, parts, t_ns) for one in each], axis=1),
+        body_parts=tuple(of_person(part, number) for number in run.people for part in parts),
+        body_radius_m=np.tile([radii_m[part] for part in parts], len(each)),
+        volumes=volume_track(named_volumes(run.occupancy)),
+        robot=robot_geometry(robot, (run.meta.get("urdf") or {}).get("text")),
         methods={name: _track(run, name, table, robot, t_ns, t0_ns, slow) for name, table in tables.items()},
         watched_m=np.array(((run.meta.get("cell") or {}).get("watched") or {}).get("corners_m", [])).reshape(-1, 2),
         objects=tuple(objects),
+        people=run.people,
+        cameras=tuple(camera_sights(run.meta)),
     )
 
 

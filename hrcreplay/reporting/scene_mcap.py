@@ -1,4 +1,4 @@
-"""scene.mcap: a run's 3-D scene with Foxglove's well-known messages, for Foxglove and Rerun.
+"""scene.mcap: a run's 3-D scene with Foxglove's well-known messages, and the robot's URDF with its joints' positions.
 
 The links are attached to the frames of the axes that move them, so each method's robot is drawn once and moved by /tf.
 """
@@ -9,6 +9,7 @@ import heapq
 import json
 import math
 from collections.abc import Iterator
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -16,20 +17,20 @@ import numpy as np
 import pandas as pd
 from foxglove import messages
 from mcap.writer import CompressionType, Writer
+from scipy.spatial.transform import Rotation
 
 from hrcreplay.geometry.distances import nearest_pair
 from hrcreplay.human.model import skeleton
 from hrcreplay.records import JOINTS, LENGTHS, Floats
 from hrcreplay.reporting import scene_messages as parts
-from hrcreplay.reporting.figures.drawing import BONES
 from hrcreplay.reporting.metrics.series import times
-from hrcreplay.reporting.replay_scene import SHOWN_POINTS, MethodTrack, ReplayScene, at_rate, placements, pose_links
+from hrcreplay.reporting.replay_scene import LinkMesh, MethodTrack, ReplayScene, at_rate, placements, pose_links
 from hrcreplay.reporting.scene_messages import ROBOT, WORLD, Rgba, bones, capsule, entity, lines, surface, timestamp
 
 #: Maximum rate of volumes [Hz].
 _VOLUME_HZ = 5.0
 _CHUNK_BYTES = 1024 * 1024
-_STOP: Rgba = (0.80, 0.20, 0.15, 0.35)
+_STOP: Rgba = (0.00, 0.51, 0.43, 0.35)
 _WATCHED: Rgba = (0.95, 0.55, 0.10, 1.0)
 _OBJECT: Rgba = (0.60, 0.55, 0.48, 0.75)
 _OTHER: Rgba = (0.45, 0.50, 0.55, 0.35)
@@ -37,6 +38,10 @@ _BODY: Rgba = (0.40, 0.63, 0.82, 1.0)
 _CAMERA: Rgba = (0.35, 0.60, 0.30, 0.8)
 _DISTANCE: Rgba = (0.48, 0.12, 0.64, 1.0)
 _BONE_M = 0.02
+#: Depth of the drawn view of a camera [m].
+_VIEW_DEPTH_M = 0.35
+#: Before the frames of the URDF's links; the layout states it, too.
+URDF_PREFIX = "urdf/"
 #: A message: topic, instant [ns], and content.
 Message = tuple[str, int, Any]
 #: Numbers of a method over time, for plots.
@@ -51,6 +56,11 @@ _SERIES_SCHEMA = {
 }
 
 
+def foxglove_layout() -> str:
+    """Returns the layout in which Foxglove shows such a scene."""
+    return resources.files("hrcreplay.reporting").joinpath("foxglove-layout.json").read_text("utf-8")
+
+
 def write_scene(path: Path, scene: ReplayScene, measurements: pd.DataFrame | None) -> None:
     """Writes the scene of a run.
 
@@ -59,24 +69,41 @@ def write_scene(path: Path, scene: ReplayScene, measurements: pd.DataFrame | Non
         scene: The scene.
         measurements: Rows of measurements.parquet: the skeletons of the cameras; None without them.
     """
-    streams = [_robots(scene), _watched(scene), _objects(scene), _transforms(scene), _person(scene), _volumes(scene)]
-    streams += [_distances(scene)]
+    streams = [_description(scene), _robots(scene), _watched(scene), _objects(scene), _sights(scene)]
+    streams += [_transforms(scene), _joints(scene), _person(scene), _volumes(scene), _distances(scene)]
     streams += [_series(scene, name, track) for name, track in scene.methods.items()]
     streams += _cameras(measurements)
     found = heapq.merge(*streams, key=lambda message: message[1])  # one instant: in the order of the streams
     with path.open("wb") as file:
         writer = Writer(file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
         writer.start(profile="", library="hrcreplay")  # the version of the library would change the bytes
+        start_ns, urdf = int(scene.t_ns[0]), scene.robot.urdf.encode()
+        writer.add_attachment(start_ns, start_ns, "robot.urdf", "application/xml", urdf)
         channels: dict[str, int] = {}
         for topic, t_ns, message in found:
             if topic not in channels:
                 channels[topic] = _channel(writer, topic, message)
-            data = message.encode() if not isinstance(message, bytes) else message
+            data = (
+                message
+                if isinstance(message, bytes)
+                else _cdr(message)
+                if isinstance(message, str)
+                else message.encode()
+            )
             writer.add_message(channels[topic], log_time=t_ns, publish_time=t_ns, data=data)
         writer.finish()  # type: ignore[no-untyped-call]
 
 
+def _cdr(text: str) -> bytes:
+    """Returns a std_msgs/String as ROS 2 writes it."""
+    encoded = text.encode() + b"\0"
+    return b"\x00\x01\x00\x00" + len(encoded).to_bytes(4, "little") + encoded
+
+
 def _channel(writer: Writer, topic: str, message: Any) -> int:
+    if isinstance(message, str):
+        schema = writer.register_schema(name="std_msgs/msg/String", encoding="ros2msg", data=b"string data\n")
+        return int(writer.register_channel(topic=topic, message_encoding="cdr", schema_id=schema))
     if isinstance(message, bytes):
         text = json.dumps(_SERIES_SCHEMA, sort_keys=True).encode()
         schema = writer.register_schema(name="hrcreplay.Series", encoding="jsonschema", data=text)
@@ -91,24 +118,68 @@ def _base(scene: ReplayScene, name: str) -> str:
     return "/plan" if name == next(iter(scene.methods)) else f"/baseline/{name}"
 
 
+def _description(scene: ReplayScene) -> Iterator[Message]:
+    """Yields the robot's URDF, for Foxglove's layer of that kind."""
+    yield "/robot_description", int(scene.t_ns[0]), scene.robot.urdf
+
+
+def _joints(scene: ReplayScene) -> Iterator[Message]:
+    """Yields the positions of the axes of the plan's robot."""
+    table = np.round(next(iter(scene.methods.values())).q, 6).tolist()
+    for t_ns, row in zip(scene.t_ns.tolist(), table, strict=True):
+        joints = [
+            messages.JointState(name=name, position=position)
+            for name, position in zip(scene.robot.joints, row, strict=True)
+            if position == position  # NaN: not known
+        ]
+        if joints:
+            yield "/plan/joints", t_ns, messages.JointStates(timestamp=timestamp(t_ns), joints=joints)
+
+
+def _mesh_entity(scene: ReplayScene, mesh: LinkMesh, name: str, frame: str, rgba: Rgba) -> Any:
+    """Returns the surface of a body of the robot, every triangle with corners of its own, so that edges are sharp."""
+    corners = np.round(mesh.vertices_m[mesh.triangles.ravel()], 4)
+    shape = messages.TriangleListPrimitive(points=parts.points(corners), color=parts.colour(rgba))
+    return entity(int(scene.t_ns[0]), name, frame=frame, triangles=[shape])
+
+
+def _meshes(scene: ReplayScene, method: str, where: str, rgba: Rgba) -> Any:
+    """Returns the meshes of a method's robot, and the capsules of links without one."""
+    robot = scene.robot
+    covered = {mesh.link for mesh in robot.meshes}
+    entities = [
+        _mesh_entity(scene, mesh, f"{where[1:]} body {k}", _frame(method, robot.axes_of(mesh), ""), rgba)
+        for k, mesh in enumerate(robot.meshes)
+    ]
+    entities += [
+        _capsule_entity(scene, i, f"{where[1:]} {link}", _frame(method, int(robot.moved_by[i]), ""), rgba)
+        for i, link in enumerate(robot.links)
+        if i not in covered
+    ]
+    return messages.SceneUpdate(entities=entities)
+
+
+def _capsule_entity(scene: ReplayScene, link: int, name: str, frame: str, rgba: Rgba) -> Any:
+    robot = scene.robot
+    shapes = capsule(robot.ends_m[link], float(robot.radius_m[link]), rgba)
+    return entity(int(scene.t_ns[0]), name, frame=frame, **shapes)
+
+
 def _robots(scene: ReplayScene) -> Iterator[Message]:
-    """Yields the links of each method's robot, and the end of the plan's stop, each in the frame of its last axis."""
+    """Yields each method's robot by its meshes, its capsules, and the end of the plan's stop, in the axes' frames."""
     t_ns = int(scene.t_ns[0])
     for name in scene.methods:
         topic = _base(scene, name)
-        shown = [(f"{topic}/robot", "", ROBOT if topic == "/plan" else _OTHER)]
+        rgba = ROBOT if topic == "/plan" else _OTHER
+        yield f"{topic}/robot", t_ns, _meshes(scene, name, f"{topic}/robot", rgba)
+        shown = [(f"{topic}/capsules", "", (*rgba[:3], 0.25))]
         if topic == "/plan":
             shown.append((f"{topic}/stop", " stop", _STOP))
         for where, suffix, rgba in shown:
-            robot = scene.robot
+            moved_by = scene.robot.moved_by.tolist()
             entities = [
-                entity(
-                    t_ns,
-                    f"{where[1:]} {link}",
-                    frame=_frame(name, int(robot.moved_by[i]), suffix),
-                    **capsule(robot.ends_m[i], float(robot.radius_m[i]), rgba),
-                )
-                for i, link in enumerate(robot.links)
+                _capsule_entity(scene, i, f"{where[1:]} {link}", _frame(name, moved_by[i], suffix), rgba)
+                for i, link in enumerate(scene.robot.links)
             ]
             yield where, t_ns, messages.SceneUpdate(entities=entities)
 
@@ -142,8 +213,21 @@ def _objects(scene: ReplayScene) -> Iterator[Message]:
     yield "/objects", t_ns, messages.SceneUpdate(entities=entities)
 
 
+def _sights(scene: ReplayScene) -> Iterator[Message]:
+    """Yields the cameras, as the edges of the pyramids that they see."""
+    if not scene.cameras:
+        return
+    t_ns = int(scene.t_ns[0])
+    entities = []
+    for one in scene.cameras:
+        tip, *base = np.round(one.corners_m(_VIEW_DEPTH_M), 4)
+        edges = [pair for k, corner in enumerate(base) for pair in ((tip, corner), (corner, base[(k + 1) % 4]))]
+        entities.append(entity(t_ns, f"camera {one.name}", lines=[lines(np.array(edges), 0.008, _CAMERA)]))
+    yield "/cameras", t_ns, messages.SceneUpdate(entities=entities)
+
+
 def _transforms(scene: ReplayScene) -> Iterator[Message]:
-    """Yields the frames of all axes of all methods, one update per instant."""
+    """Yields the frames of all axes of all methods and of the URDF's root, one update per instant."""
     frames: list[str] = []
     numbers: list[Floats] = []
     plan = next(iter(scene.methods))
@@ -155,6 +239,10 @@ def _transforms(scene: ReplayScene) -> Iterator[Message]:
                 rows = np.column_stack([np.round(at_m, 5), np.round(turned.as_quat(canonical=True), 6)])
                 rows[~known] = np.nan
                 numbers.append(rows)
+    root = scene.robot.T_world_root
+    frames.append(f"{URDF_PREFIX}{scene.robot.root}")
+    at_root = [*root[:3, 3].tolist(), *Rotation.from_matrix(root[:3, :3]).as_quat(canonical=True).tolist()]
+    numbers.append(np.round(np.tile(at_root, (len(scene.t_ns), 1)), 6))
     table = np.stack(numbers, axis=1)
     for t_ns, rows in zip(scene.t_ns.tolist(), table, strict=True):
         stamp = timestamp(t_ns)
@@ -177,27 +265,40 @@ def _transforms(scene: ReplayScene) -> Iterator[Message]:
         )
 
 
+def _capsules(ends_m: Floats, radius_m: Floats, rgba: Rgba) -> dict[str, Any]:
+    """Returns the primitives of the known ones of some capsules, (n, 2, 3) and (n,) [m]."""
+    known = np.flatnonzero(np.isfinite(ends_m).all(axis=(1, 2))).tolist()
+    each = [capsule(ends_m[k], float(radius_m[k]), rgba) for k in known]
+    return {kind: [shape for one in each for shape in one[kind]] for kind in ("spheres", "cylinders")}
+
+
 def _person(scene: ReplayScene) -> Iterator[Message]:
-    """Yields the fused skeleton, its points, and the recorded body as lines as thick as its parts."""
+    """Yields the fused skeletons, their points, and the recorded bodies as capsules."""
     fields = [
         messages.PackedElementField(name=axis, offset=4 * i, type=messages.PackedElementFieldNumericType.Float32)
         for i, axis in enumerate("xyz")
     ]
-    pairs = [[SHOWN_POINTS.index(a), SHOWN_POINTS.index(b)] for a, b in BONES]
+    names = ["" if number == 1 else f" {number}" for number in scene.people]
+    pairs = np.split(scene.bones, len(names))
+    owned = np.split(np.arange(len(scene.body_parts)), len(names))
     shown, body = np.round(scene.points_m, 3), np.round(scene.body_m, 3)
     origin = parts.pose(np.zeros(3))
     for i, t_ns in enumerate(scene.t_ns.tolist()):
-        skeleton_lines = [lines(shown[i, pairs], _BONE_M, parts.PERSON)]
-        yield "/person/fused", t_ns, messages.SceneUpdate(entities=[entity(t_ns, "fused", lines=skeleton_lines)])
+        skeletons = [
+            entity(t_ns, f"fused{name}", lines=[lines(shown[i, of_one], _BONE_M, parts.PERSON)])
+            for name, of_one in zip(names, pairs, strict=True)
+        ]
+        yield "/person/fused", t_ns, messages.SceneUpdate(entities=skeletons)
         known = shown[i][np.isfinite(shown[i]).all(axis=1)].astype("<f4")
         cloud = messages.PointCloud(
             timestamp=timestamp(t_ns), frame_id=WORLD, pose=origin, point_stride=12, fields=fields, data=known.tobytes()
         )
         yield "/person/points", t_ns, cloud
-        thick = [
-            lines(body[i, [k]], 2.0 * float(radius), _BODY) for k, radius in enumerate(scene.body_radius_m.tolist())
+        bodies = [
+            entity(t_ns, f"recorded{name}", **_capsules(body[i, of_one], scene.body_radius_m[of_one], _BODY))
+            for name, of_one in zip(names, owned, strict=True)
         ]
-        yield "/person/recorded", t_ns, messages.SceneUpdate(entities=[entity(t_ns, "recorded", lines=thick)])
+        yield "/person/recorded", t_ns, messages.SceneUpdate(entities=bodies)
 
 
 def _volumes(scene: ReplayScene) -> Iterator[Message]:
@@ -251,6 +352,8 @@ def _cameras(measurements: pd.DataFrame | None) -> list[Iterator[Message]]:
 def _camera(camera: str, rows: pd.DataFrame) -> Iterator[Message]:
     rows = rows.sort_values("arrival_ns", kind="stable")
     at = np.round(skeleton(rows[list(JOINTS)].to_numpy(dtype=float), rows[list(LENGTHS)].to_numpy(dtype=float)), 3)
-    for t_ns, found in zip(times(rows, "arrival_ns").tolist(), at, strict=True):
-        shown = entity(t_ns, f"camera {camera}", lines=[bones(found, _CAMERA)])
+    people = rows["person"].tolist() if "person" in rows else [1] * len(rows)
+    for t_ns, found, number in zip(times(rows, "arrival_ns").tolist(), at, people, strict=True):
+        name = f"camera {camera}" if number == 1 else f"camera {camera}, person {number}"
+        shown = entity(t_ns, name, lines=[bones(found, _CAMERA)])
         yield f"/camera/{camera}", t_ns, messages.SceneUpdate(entities=[shown])

@@ -13,7 +13,7 @@ import pandas as pd
 
 from hrcreplay.human.model import LimitSet
 from hrcreplay.logs import camera_checks
-from hrcreplay.records import BODY, BORDER, JOINTS
+from hrcreplay.records import BODY, BORDER, JOINTS, OF_PERSON
 from hrcreplay.reporting.metrics.series import ANGLES, Metric
 from hrcreplay.robot.model import RobotModel
 
@@ -371,13 +371,9 @@ _PART_NAMES = {
 }
 
 
-#: Between a limb and its person in the name of a volume of person 2, 3, ...
-_OF_PERSON = " of person "
-
-
 def part_name_text(part: str) -> str:
     """Returns the name for readers of a part of a recorded body."""
-    limb, of, number = part.partition(_OF_PERSON)
+    limb, of, number = part.partition(OF_PERSON)
     if of:
         return f"{part_name_text(limb)}{of}{number}"
     return LIMB_NAMES.get(part) or _PART_NAMES.get(part, part)
@@ -385,7 +381,7 @@ def part_name_text(part: str) -> str:
 
 def neighbour_text(part: str) -> str:
     """Describes the neighbour of a link: a part of the person, or the border beyond which others may be."""
-    if _OF_PERSON in part:
+    if OF_PERSON in part:
         return f"the {part_name_text(part)}"
     return f"the {part_name_text(part)}" if part == BORDER else f"the person's {part_name_text(part)}"
 

@@ -308,10 +308,17 @@ def record_columns(rows: Sequence[Any]) -> Columns:
     return {name: _text(values) if isinstance(values[0], str) else np.array(values) for name, values in columns.items()}
 
 
-def body_columns(t_ns: Ints, axes_m: Floats, parts: tuple[str, ...]) -> Columns:
-    """Returns one row per instant: (n, p, 2, 3) ends of the recorded body's capsules, world [m]; NaN if unknown."""
+def body_columns(t_ns: Ints, axes_m: Floats, parts: tuple[str, ...], person: Ints | None = None) -> Columns:
+    """Returns one row per instant and person.
+
+    Args:
+        t_ns: (n,) instants [ns].
+        axes_m: (n, p, 2, 3) ends of the recorded body's capsules, world; NaN if unknown [m].
+        parts: Names of the p capsules.
+        person: (n,) number of the person; None: person 1.
+    """
     names = [f"{part}_{end}_{axis}" for part in parts for end in (0, 1) for axis in "xyz"]
-    return {"t_ns": t_ns, **_spread(axes_m.reshape(len(t_ns), -1), names)}
+    return with_person({"t_ns": t_ns, **_spread(axes_m.reshape(len(t_ns), -1), names)}, person)
 
 
 def _spread(array: Floats, names: tuple[str, ...] | list[str], suffix: str = "") -> Columns:

@@ -238,7 +238,12 @@ class Run:
             return table[table["person"] == number].drop(columns="person").reset_index(drop=True)
 
         state, measurements, occupancy = map(rows, (self.state, self.measurements, self.occupancy))
-        return replace(self, state=state, measurements=measurements, occupancy=occupancy)
+        return replace(self, state=state, measurements=measurements, occupancy=occupancy, body=rows(self.body))
+
+    def states(self) -> list[pd.DataFrame]:
+        """The fused states of each person; none without any."""
+        each = [self.of_person(number).state for number in self.people]
+        return [state for state in each if state is not None]
 
     @property
     def T_world_base(self) -> Floats | None:

@@ -89,3 +89,29 @@ def _contact(t_ns: np.ndarray, t_s: Floats, method: str) -> pd.DataFrame:
             "left_full_limb": None,
         }
     )
+
+
+#: Where person 2 of ``two_people`` is beside person 1 [m].
+SECOND_M = np.array([0.5, -0.25, 0.0])
+
+
+def two_people(run: Run) -> Run:
+    """The run with a second person who does all that the first does, somewhere else."""
+    assert run.state is not None
+    assert run.occupancy is not None
+    assert run.body is not None
+    state = run.state.assign(**{axis: run.state[axis] + SECOND_M[k] for k, axis in enumerate("xy")})
+    moved = [np.ravel(np.reshape(flat, (-1, 3)) + SECOND_M) for flat in run.occupancy["vertices"]]
+    ends = [str(name) for name in run.body.columns[1:]]
+    body = {name: run.body[name] + SECOND_M["xyz".index(name[-1])] for name in ends}
+    return dataclasses.replace(
+        run,
+        state=_both(run.state, state),
+        occupancy=_both(run.occupancy, run.occupancy.assign(vertices=pd.Series(moved, run.occupancy.index))),
+        body=_both(run.body, run.body.assign(**body)),
+    )
+
+
+def _both(first: pd.DataFrame, second: pd.DataFrame) -> pd.DataFrame:
+    whole = pd.concat([first.assign(person=1), second.assign(person=2)])
+    return whole.sort_values(["t_ns", "person"], kind="stable").reset_index(drop=True)

@@ -156,6 +156,6 @@ def test_the_page_draws_a_mesh_where_its_link_is(tmp_path: Path) -> None:
 
 
 def test_a_robot_without_meshes_has_no_switch_for_them() -> None:
-    part = replay_part(moving_scene(moving_run(4.0)))
+    part = replay_part(with_meshes(moving_scene(moving_run(4.0)), {}))
     assert 'data-show="meshes"' not in part.html
     assert 'data-show="meshes"' in replay_part(with_meshes(moving_scene(moving_run(4.0)), {1: box_on(1)})).html

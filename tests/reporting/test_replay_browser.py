@@ -11,7 +11,9 @@ import pytest
 
 from hrcreplay.geometry.distances import distances
 from hrcreplay.reporting.page import report_page
+from hrcreplay.reporting.page.replay_page import touching_pairs
 from hrcreplay.reporting.replay_scene import ReplayScene
+from hrcreplay.reporting.tour import telling_moment, tour
 from tests.reporting.browser import Tab, chromium, opened
 from tests.reporting.moving import moving_run, moving_scene, robot
 from tests.reporting.reading import read
@@ -45,7 +47,9 @@ def loaded(file: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab
 
 @pytest.fixture
 def tab(loaded: Tab) -> Tab:
-    loaded.evaluate("replay.play(false), replay.choose('qp'), replay.seek(0)")
+    loaded.evaluate(
+        "replay.play(false), replay.putBeside(null), replay.choose('qp'), replay.plots.zoom(null), replay.seek(0)"
+    )
     loaded.evaluate("document.getElementById('replay').scrollIntoView()")
     return loaded
 
@@ -233,3 +237,167 @@ def test_nothing_is_wider_than_the_screen(tab: Tab, width: int) -> None:
     assert box[0] >= 0
     assert box[1] <= width
     assert tab.evaluate("document.querySelector('.plot canvas').getBoundingClientRect().right") <= width
+
+
+def test_it_opens_on_the_telling_instant_with_the_robot_in_sight(
+    file: Path, scene: ReplayScene, tmp_path: Path
+) -> None:
+    """A page of its own: a contact of scaling is what it opens with, and no point of the robot is behind the person."""
+    assert PROGRAM is not None
+    moment = telling_moment(scene)
+    with opened(PROGRAM, tmp_path) as tab:
+        tab.open(file, 1280, 900)
+        assert instant(tab) == pytest.approx(scene.seconds[moment.row], abs=1e-4)
+        assert tab.evaluate("replay.state.beside") == "scaling"
+        assert tab.evaluate("replay.view.clearest('qp', replay.view.drawn.at).hidden") == 0
+        side = np.array(tab.evaluate("replay.view.clearest('qp', replay.view.drawn.at).side.toArray()"))
+        eye, target = (
+            np.array(tab.evaluate(f"replay.view.{at}.toArray()")) for at in ("camera.position", "controls.target")
+        )
+        level = (eye - target)[:2] / np.linalg.norm((eye - target)[:2])
+        assert level @ side[:2] > 0.99
+        told = "[...document.querySelectorAll('.picture-title')].map(one => one.textContent).join()"
+        assert tab.evaluate(told) == "qp (this plan),scaling"
+        assert tab.trouble == []
+
+
+def test_two_methods_stand_side_by_side_at_the_same_instant(tab: Tab, scene: ReplayScene) -> None:
+    row = 80  # scaling touches at 3.2 s, qp does not
+    tab.evaluate(f"replay.putBeside('scaling'), replay.seek({scene.seconds[row]})")
+    assert [box["hidden"] for box in boxes(tab, ".picture")] == [False, False]
+    left, right = boxes(tab, ".picture")
+    assert left["right"] == pytest.approx(right["left"], abs=1.0)
+    assert tab.evaluate("replay.view.camera.aspect") == pytest.approx(
+        left["width"] / tab.evaluate("document.querySelector('.stage canvas').clientHeight"), rel=0.01
+    )
+    ends = np.array(tab.evaluate("replay.view.ends.map(pair => pair.map(end => end.toArray()))"))
+    model = robot(moving_run(2.0))
+    np.testing.assert_allclose(ends, model.ends_m(scene.methods["qp"].q[row]), atol=1e-3)  # the plan is drawn last
+    assert not tab.evaluate("document.querySelector('.readout.other').hidden")
+    assert "scaling" in tab.evaluate("document.querySelector('.readout.other').textContent")
+    alone = picture(tab)
+    tab.evaluate("replay.putBeside(null)")
+    assert [box["hidden"] for box in boxes(tab, ".picture")] == [False, True]
+    assert picture(tab) != alone
+    tab.press("b")
+    assert tab.evaluate("replay.state.beside") == "qp"
+
+
+def boxes(tab: Tab, what: str) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = tab.evaluate(
+        f"[...document.querySelectorAll('{what}')].map(one => {{ const b = one.getBoundingClientRect(); "
+        "return { left: b.left, right: b.right, width: b.width, hidden: one.hidden }; })"
+    )
+    return found
+
+
+def test_what_touches_is_red_and_named(tab: Tab, scene: ReplayScene) -> None:
+    """The tables' contact is made up; that of the picture is of its own capsules, so grow them until they meet."""
+    tab.evaluate(f"replay.seek({scene.seconds[80]})")
+    assert tab.evaluate("document.querySelector('.picture-touch').hidden")
+    grown = 0.3
+    tab.evaluate(f"(replay.data.header.body.radius_m = replay.data.header.body.radius_m.map(r => r + {grown}), 0)")
+    try:
+        tab.evaluate("replay.view.known.clear(), replay.seek(replay.state.t_s), 0")
+        near = tab.evaluate("replay.view.render()[0].touching.map(({ link, part }) => [link, part])")
+        links = robot(moving_run(2.0)).ends_m(scene.methods["qp"].q[80])
+        want = touching_pairs(links, scene.robot.radius_m, scene.body_m[80], scene.body_radius_m + grown)
+        assert sorted(map(tuple, near)) == sorted(want)
+        assert want
+        said = tab.evaluate("document.querySelector('.picture-touch').textContent")
+        assert said.startswith("contact: ")
+        assert said.split(" \u2013 ")[0].removeprefix("contact: ") in scene.robot.links
+        assert tab.evaluate("replay.view.touch.group.visible")
+        marked = "one => one.material === replay.view.materials.touchMesh"
+        red = tab.evaluate(f"replay.view.surfaces.group.children.filter({marked}).length")
+        meshed = {mesh.link for mesh in scene.robot.meshes}
+        assert red == len({link for link, _ in want} & meshed)
+        assert "in contact" in tab.evaluate("document.querySelector('.readout').textContent")
+    finally:
+        tab.evaluate(f"(replay.data.header.body.radius_m = replay.data.header.body.radius_m.map(r => r - {grown}), 0)")
+        tab.evaluate("replay.view.known.clear()")
+    tab.evaluate("replay.seek(replay.state.t_s)")
+    assert not tab.evaluate("replay.view.touch.group.visible")
+
+
+def test_the_tour_visits_its_stops_in_turn(tab: Tab, scene: ReplayScene) -> None:
+    stops = tour(scene)
+    assert len(stops) > 1
+    tab.evaluate("replay.startTour()")
+    assert instant(tab) >= stops[0].from_s - 1e-3
+    assert stops[0].words in tab.evaluate("document.querySelector('.caption').textContent")
+    for k in range(1, len(stops)):
+        tab.evaluate(f"replay.seek({stops[k - 1].until_s})")
+        tab.evaluate(
+            "new Promise(done => { const look = () => "
+            f"replay.state.tour === {k} ? done(1) : setTimeout(look, 20); look(); }})"
+        )
+        assert stops[k].words in tab.evaluate("document.querySelector('.caption').textContent")
+        assert tab.evaluate("replay.state.beside") == stops[k].beside
+    tab.evaluate(f"replay.seek({stops[-1].until_s})")
+    tab.evaluate(
+        "new Promise(done => { const look = () => replay.state.playing ? setTimeout(look, 20) : done(1); look(); })"
+    )
+    assert tab.evaluate("replay.state.tour") is None
+    assert tab.evaluate("document.querySelector('.caption').hidden")
+    assert instant(tab) == pytest.approx(stops[-1].until_s, abs=0.05)
+
+
+def test_a_drag_zooms_the_plots_and_a_double_click_shows_all(tab: Tab, scene: ReplayScene) -> None:
+    tab.evaluate("document.querySelector('.plots').scrollIntoView({ block: 'center', behavior: 'instant' })")
+    settled(tab)
+    x, y, width = tab.evaluate(
+        "(b => [b.left, b.top + b.height / 2, b.width])"
+        "(document.querySelector('.plot .u-over').getBoundingClientRect())"
+    )
+    before_s = instant(tab)
+    tab.call("Input.dispatchMouseEvent", type="mouseMoved", x=x + 0.25 * width, y=y)
+    for kind, share in (("mousePressed", 0.25), ("mouseMoved", 0.4), ("mouseMoved", 0.5), ("mouseReleased", 0.5)):
+        buttons = {"buttons": 1} if kind == "mouseMoved" else {"clickCount": 1}
+        tab.call("Input.dispatchMouseEvent", type=kind, x=x + share * width, y=y, button="left", **buttons)
+    settled(tab)
+    span = float(scene.seconds[-1])
+    for k in (0, 1):  # both plots show the same stretch
+        low, high = tab.evaluate(f"(s => [s.min, s.max])(replay.plots.plots[{k}].plot.scales.x)")
+        assert (low, high) == pytest.approx((0.25 * span, 0.5 * span), abs=0.03 * span)
+    assert instant(tab) == before_s  # a drag is no press
+    assert not tab.evaluate("document.querySelector('.whole').hidden")
+    for count in (1, 2):
+        for kind in ("mousePressed", "mouseReleased"):
+            tab.call("Input.dispatchMouseEvent", type=kind, x=x + 0.5 * width, y=y, button="left", clickCount=count)
+    settled(tab)
+    assert tab.evaluate("(s => [s.min, s.max])(replay.plots.plots[0].plot.scales.x)") == pytest.approx([0.0, span])
+    assert tab.evaluate("document.querySelector('.whole').hidden")
+
+
+def test_contents_come_first_and_parts_open_for_a_link(tab: Tab) -> None:
+    tab.evaluate("document.documentElement.scrollTo({ top: 0, behavior: 'instant' })")
+    settled(tab)
+    top = {
+        name: tab.evaluate(f"document.querySelector('{name}').getBoundingClientRect().top + scrollY")
+        for name in ("nav", "#replay", "main")
+    }
+    assert top["nav"] < top["#replay"] < top["main"]
+    assert top["nav"] < 300
+    closed = tab.evaluate("document.documentElement.scrollHeight")
+    assert tab.evaluate("document.querySelectorAll('main .part[open]').length") == 0
+    tab.evaluate("document.querySelector('nav a[href=\"#fusion\"]').click()")
+    tab.evaluate("new Promise(done => setTimeout(done, 50))")
+    assert tab.evaluate("document.querySelector('#fusion .part').open")
+    tab.evaluate("document.querySelector('.unfold').click()")
+    assert tab.evaluate("[...document.querySelectorAll('main details')].every(one => one.open)")
+    assert tab.evaluate("document.documentElement.scrollHeight") > closed
+    tab.evaluate("document.querySelector('.unfold').click()")
+    assert tab.evaluate("document.documentElement.scrollHeight") == closed
+
+
+def test_a_table_wider_than_a_phone_says_that_it_scrolls(tab: Tab) -> None:
+    tab.look(390, 844)
+    settled(tab)
+    told = tab.evaluate(
+        "[...document.querySelectorAll('.scroll')].map(one => [one.scrollWidth > one.clientWidth + 1, "
+        "getComputedStyle(one, '::before').content.includes('scroll sideways')])"
+    )
+    assert any(wide for wide, _ in told)
+    assert all(wide == says for wide, says in told)
+    tab.look(1280, 900)

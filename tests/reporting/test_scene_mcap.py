@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.reader import make_reader
@@ -16,13 +17,13 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 import hrcreplay
-from hrcreplay.reporting.replay_scene import ReplayScene, pose_links
+from hrcreplay.reporting.replay_scene import CameraSight, ReplayScene, pose_links
 from hrcreplay.reporting.scene_mcap import write_scene
 from hrcreplay.reporting.scene_messages import surface, surface_mesh
 from hrcreplay.robot.control.static_obstacles import StaticHull
 from tests.reporting.moving import moving_run, moving_scene, robot
 
-LAYOUT = Path(hrcreplay.__file__).parents[1] / "docs" / "foxglove-layout.json"
+LAYOUT = Path(hrcreplay.__file__).parent / "reporting" / "foxglove-layout.json"
 
 
 @pytest.fixture(scope="module")
@@ -49,6 +50,9 @@ def _topics(file: Path) -> dict[str, list[tuple[int, Any]]]:
     with file.open("rb") as stream:
         for schema, channel, message in make_reader(stream).iter_messages():
             assert schema is not None
+            if schema.encoding == "ros2msg":
+                found[channel.topic].append((message.log_time, message.data))
+                continue
             if schema.encoding == "jsonschema":
                 found[channel.topic].append((message.log_time, json.loads(message.data)))
                 continue
@@ -83,9 +87,9 @@ def test_the_links_hang_on_frames_that_bring_them_where_they_are(
         for one in topics["/tf"][row][1].transforms
     }
     for topic, q in (
-        ("/plan/robot", scene.methods["qp"].q),
+        ("/plan/capsules", scene.methods["qp"].q),
         ("/plan/stop", scene.methods["qp"].stop_q),
-        ("/baseline/scaling/robot", scene.methods["scaling"].q),
+        ("/baseline/scaling/capsules", scene.methods["scaling"].q),
     ):
         want = robot(moving_run(2.0)).ends_m(q[row])
         for i, shown in enumerate(topics[topic][0][1].entities):
@@ -182,7 +186,10 @@ def test_the_same_scene_gives_the_same_bytes(file: Path, scene: ReplayScene, tmp
 def test_the_layout_shows_topics_that_there_are(topics: dict[str, list[tuple[int, Any]]]) -> None:
     layout = json.loads(LAYOUT.read_text())
     shown = layout["configById"]["3D!scene"]["topics"]
-    assert set(shown) <= topics.keys()
+    assert set(shown) - {"/objects", "/cameras", "/watched"} <= topics.keys()  # these only where a cell has them
+    layer = layout["configById"]["3D!scene"]["layers"]["robot"]
+    assert {layer["topic"], layer["jointStatesTopic"]} <= topics.keys()
+    assert f"{layer['framePrefix']}base" in [one.child_frame_id for one in topics["/tf"][0][1].transforms]
     paths = [path["value"] for panel in layout["configById"].values() for path in panel.get("paths", ())]
     assert len(paths) > 4
     row = topics["/plan/series"][0][1]
@@ -211,3 +218,77 @@ def test_objects_are_closed_surfaces_around_their_hulls(scene: ReplayScene, tmp_
 def _topics_of_scene(scene: ReplayScene, path: Path) -> dict[str, list[tuple[int, Any]]]:
     write_scene(path, scene, None)
     return _topics(path)
+
+
+def test_the_urdf_is_attached_and_told_with_the_positions_of_its_joints(
+    file: Path, topics: dict[str, list[tuple[int, Any]]], scene: ReplayScene, tmp_path: Path
+) -> None:
+    """pinocchio makes a robot of the attachment, and the joint states bring its links to where the tables have them."""
+    with file.open("rb") as stream:
+        (attached,) = make_reader(stream).iter_attachments()
+    assert (attached.name, attached.media_type) == ("robot.urdf", "application/xml")
+    ((_, told),) = topics["/robot_description"]
+    length = int.from_bytes(told[4:8], "little")
+    assert told[8 : 8 + length - 1] == attached.data
+    (tmp_path / "robot.urdf").write_bytes(attached.data)
+    model = pin.buildModelFromUrdf(str(tmp_path / "robot.urdf"))
+    shapes = pin.buildGeomFromUrdf(model, str(tmp_path / "robot.urdf"), pin.GeometryType.VISUAL)
+    assert len(shapes.geometryObjects) == 3 * len(scene.robot.links)  # a cylinder and two balls of each capsule
+    row = 57
+    t_ns, states = topics["/plan/joints"][row]
+    assert t_ns == scene.t_ns[row]
+    q = np.zeros(model.nq)
+    for joint in states.joints:
+        q[model.joints[model.getJointId(joint.name)].idx_q] = joint.position
+    np.testing.assert_allclose(q, scene.methods["qp"].q[row], atol=1e-6)
+    data, placed = model.createData(), shapes.createData()
+    pin.updateGeometryPlacements(model, data, shapes, placed, q)
+    frames = {one.child_frame_id: one for one in topics["/tf"][row][1].transforms}
+    root = frames["urdf/base"].translation
+    balls = [k for k, one in enumerate(shapes.geometryObjects) if type(one.geometry).__name__ == "Sphere"]
+    centres = np.array([placed.oMg[k].translation for k in balls]) + np.array([root.x, root.y, root.z])
+    want = robot(moving_run(2.0)).ends_m(scene.methods["qp"].q[row]).reshape(-1, 3)
+    for end in want:
+        assert np.linalg.norm(centres - end, axis=1).min() < 1e-5
+
+
+def test_the_robot_is_shown_by_its_meshes_in_the_frames_of_its_axes(
+    topics: dict[str, list[tuple[int, Any]]], scene: ReplayScene
+) -> None:
+    ((_, update),) = topics["/plan/robot"]
+    bodies = [one for one in update.entities if one.triangles]
+    assert [one.frame_id for one in bodies] == ["world", *(f"qp axis {axis}" for axis in range(1, 7))]
+    for body, mesh in zip(bodies, scene.robot.meshes, strict=True):
+        corners = np.array([[p.x, p.y, p.z] for p in body.triangles[0].points]).reshape(-1, 3, 3)
+        np.testing.assert_allclose(corners, mesh.vertices_m[mesh.triangles], atol=0.51e-4)
+    assert [one.id for one in update.entities if not one.triangles] == [
+        "plan/robot tool"
+    ]  # a capsule: no mesh shows it
+
+
+def test_the_recorded_body_is_shown_by_its_capsules(
+    topics: dict[str, list[tuple[int, Any]]], scene: ReplayScene
+) -> None:
+    row = 33
+    (body,) = topics["/person/recorded"][row][1].entities
+    centres = np.array([[p.pose.position.x, p.pose.position.y, p.pose.position.z] for p in body.spheres])
+    np.testing.assert_allclose(centres, scene.body_m[row].reshape(-1, 3), atol=0.51e-3)
+    np.testing.assert_allclose([one.size.x for one in body.spheres], np.repeat(2.0 * scene.body_radius_m, 2))
+    lengths = np.linalg.norm(scene.body_m[row, :, 1] - scene.body_m[row, :, 0], axis=1)
+    np.testing.assert_allclose([one.size.z for one in body.cylinders], lengths, atol=2e-3)
+
+
+def test_cameras_are_shown_by_what_they_see(scene: ReplayScene, tmp_path: Path) -> None:
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("xyz", [-100.0, 0.0, 30.0], degrees=True).as_matrix()
+    T[:3, 3] = 2.0, -1.0, 1.4
+    sight = CameraSight("kinect", T, (float(np.tan(0.5)), float(np.tan(0.4))), True)
+    found = _topics_of_scene(dataclasses.replace(scene, cameras=(sight,)), tmp_path / "seen.mcap")
+    ((_, update),) = found["/cameras"]
+    points = np.array([[p.x, p.y, p.z] for p in update.entities[0].lines[0].points])
+    in_camera = (points - T[:3, 3]) @ T[:3, :3]
+    depth = in_camera[:, 2].max()
+    far = in_camera[in_camera[:, 2] > 0.5 * depth]
+    np.testing.assert_allclose(np.abs(far[:, 0] / far[:, 2]), np.tan(0.5), atol=2e-3)
+    np.testing.assert_allclose(np.abs(far[:, 1] / far[:, 2]), np.tan(0.4), atol=2e-3)
+    assert len(points) == 16

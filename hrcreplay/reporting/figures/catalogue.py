@@ -17,6 +17,7 @@ from hrcreplay.reporting.figures.planning import SHORTEST_M, Deviation
 from hrcreplay.reporting.figures.prediction import Growth, Instant, Sweep, Walk
 from hrcreplay.reporting.figures.scene import LinkPose, Storyboard
 from hrcreplay.reporting.metrics.fusion import cameras
+from hrcreplay.reporting.metrics.people import named_volumes
 from hrcreplay.reporting.metrics.series import Metric, find_known_ticks, instants, moment_ns, start_ns
 from hrcreplay.settings.sections import Logs, setting
 from hrcreplay.store.run_folder import Run
@@ -28,7 +29,7 @@ _T = TypeVar("_T")
 class FigureData:
     """Input of figures: the run's tables and metrics, and the prediction at some instants."""
 
-    run: Run
+    run: Run  #: of one person
     metrics: Mapping[str, Metric]
     near_m: float  #: the stationary share counts ticks with a separation of at most this
     stationary_m_per_s: float  #: a TCP slower than this counts as stationary
@@ -39,6 +40,7 @@ class FigureData:
     growth: Growth | None = None
     story: Storyboard | None = None
     pose: LinkPose | None = None  #: the robot at the tick that ``nearest_tick`` names
+    everybody: Run | None = None  #: the run with all people; None: there is one
 
     @property
     def t0_ns(self) -> int:
@@ -54,6 +56,11 @@ class FigureData:
     def state(self) -> pd.DataFrame:
         """Rows of state.parquet."""
         return require(self.run.state)
+
+    @cached_property
+    def volumes(self) -> pd.DataFrame | None:
+        """Rows of occupancy.parquet of all people, each limb named with its person."""
+        return named_volumes((self.everybody or self.run).occupancy)
 
     @cached_property
     def worst(self) -> Deviation:
@@ -80,6 +87,8 @@ class FigureKind:
     draw: Callable[[FigureData], Figure]
     caption: str
     predicted: str = ""  #: field of FigureData that must be computed for it
+    each: bool = False  #: True: one for each person
+    one: bool = False  #: True: shows one person, the first
 
 
 #: Data that a run may lack: a test for their presence, and a message if they are missing.
@@ -138,6 +147,7 @@ FIGURES = (
         "reaches within the stopping time, as in the paper. Orange: their convex approximation, Eq. (22)-(30), "
         "corrected. Blue: every walk under the joints' bounds, of every likely state. Red: where the person walked.",
         "walk",
+        one=True,
     ),
     FigureKind(
         "fig07_sweeps",
@@ -150,6 +160,7 @@ FIGURES = (
         "all angles that it can reach by the paper's method: arcs in triangles, and their hull. On the left that set "
         "is displaced to all positions that walking can reach, seen from above.",
         "sweep",
+        one=True,
     ),
     FigureKind(
         "fig09_volumes",
@@ -158,7 +169,7 @@ FIGURES = (
         "prediction",
         ("occupancy", "person"),
         lambda data: prediction.volumes_at(
-            require(data.run.occupancy), data.state, require(moment_ns(data.run)), data.t0_ns
+            require(data.volumes), (data.everybody or data.run).states(), require(moment_ns(data.run)), data.t0_ns
         ),
         "As the paper's Fig. 9. The swept volumes that this run used, limb radii included, with the fused skeleton.",
     ),
@@ -168,7 +179,7 @@ FIGURES = (
         "programmed and actual path of the TCP",
         "cost",
         ("motion", "path"),
-        lambda data: planning.path(data.motion, data.run.occupancy, data.t0_ns, data.run.T_world_base, data.worst),
+        lambda data: planning.path(data.motion, data.volumes, data.t0_ns, data.run.T_world_base, data.worst),
         "As the paper's Fig. 13(a). Programmed and actual path of the TCP. The two dots are the ends of the largest "
         "deviation; shaded: the swept volumes of the person at that tick.",
     ),
@@ -178,7 +189,7 @@ FIGURES = (
         "largest deviation from the programmed path",
         "cost",
         ("motion", "path", "deviation"),
-        lambda data: planning.deviation(data.motion, data.run.occupancy, data.t0_ns, data.worst),
+        lambda data: planning.deviation(data.motion, data.volumes, data.t0_ns, data.worst),
         "As the paper's Fig. 13(b). The largest deviation from the programmed path with its length, in the vertical "
         "plane that contains it. The paper's own deviation is 0.221 m.",
     ),
@@ -214,6 +225,7 @@ FIGURES = (
         "limb radii included: from positions and velocities (paper); by the older method, from positions only; and by "
         "this run's method, if different.",
         "instants",
+        each=True,
     ),
     FigureKind(
         "fig18_coordinate",
@@ -224,6 +236,7 @@ FIGURES = (
         lambda data: fusion.coordinate(data.run, data.t0_ns, data.gap_s),
         "As the paper's Fig. 18. One coordinate of the person as each camera saw it and as fused and, if the log has "
         "ground truth, the errors.",
+        one=True,
     ),
     FigureKind(
         "horizon",
@@ -245,6 +258,7 @@ FIGURES = (
         "How the swept volumes of the six limbs, added up, grow with the horizon: by each method at one instant "
         "(lines), and as this run stored them at all others (dots).",
         "growth",
+        one=True,
     ),
     FigureKind(
         "status",
@@ -302,6 +316,7 @@ FIGURES = (
         ("ticks",),
         lambda data: fusion.joint_angles(data.run, data.t0_ns, data.gap_s),
         "All joints of the human model: the cameras' raw values (dots) and the fused state (line).",
+        each=True,
     ),
     FigureKind(
         "data_quality",
@@ -312,6 +327,7 @@ FIGURES = (
         lambda data: fusion.data_quality(data.run, data.t0_ns, data.gap_s),
         "Times at which each camera's frames contain the person (pale), at which the filter used them (solid), and at "
         "which it had none.",
+        each=True,
     ),
 )
 
@@ -338,7 +354,14 @@ def select_figures(run: Run, metrics: Mapping[str, Metric]) -> tuple[FigureKind,
     return tuple(kind for kind in FIGURES if not missing(kind, run, metrics))
 
 
-def draw_all(data: FigureData, folder: Path, kinds: Sequence[FigureKind] | None = None) -> tuple[str, ...]:
+def file_name(kind: FigureKind, number: int) -> str:
+    """Returns the name of the files of a figure of a person, without suffix."""
+    return kind.name if number == 1 else f"{kind.name}_person_{number}"
+
+
+def draw_all(
+    data: FigureData, folder: Path, kinds: Sequence[FigureKind] | None = None, number: int = 1
+) -> tuple[str, ...]:
     """Draws figures into ``folder`` as ``<name>.png`` and ``<name>.svg``.
 
     Args:
@@ -346,6 +369,7 @@ def draw_all(data: FigureData, folder: Path, kinds: Sequence[FigureKind] | None 
         folder: Folder for the files; created if needed.
         kinds: Figures to draw; None: all for which the run has the data. A figure without its computed data is left
             out.
+        number: The person of ``data``.
 
     Returns:
         The names drawn.
@@ -356,8 +380,8 @@ def draw_all(data: FigureData, folder: Path, kinds: Sequence[FigureKind] | None 
         if kind.predicted and not getattr(data, kind.predicted):
             continue
         with drawing.style(column=True):
-            drawing.save(kind.draw(data), folder, kind.name, drawing.COLUMN_DPI)
-        names.append(kind.name)
+            drawing.save(kind.draw(data), folder, file_name(kind, number), drawing.COLUMN_DPI)
+        names.append(file_name(kind, number))
     return tuple(names)
 
 

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
-from hrcreplay.records import Floats
+from hrcreplay.records import OF_PERSON, Floats
 
 # Okabe and Ito's palette.
 ORANGE, SKY, GREEN, YELLOW = "#E69F00", "#56B4E9", "#009E73", "#F0E442"
@@ -33,6 +33,12 @@ NOMINAL, ACTUAL, FUSED, TRUTH = BLUE, VERMILLION, BLUE, INK
 CAMERAS = (ORANGE, GREEN, PURPLE, SKY)
 STATUS = {"tracking": SKY, "limited": ORANGE, "braking": VERMILLION, "retreating": PURPLE}
 LIMBS = {"HD": PURPLE, "THX": "#9aa5b1", "URA": BLUE, "LRA": SKY, "ULA": GREEN, "LLA": ORANGE, "LEGS": YELLOW}
+
+
+def limb_colour(name: str) -> str:
+    """Returns the colour of a limb of any person."""
+    return LIMBS.get(name.partition(OF_PERSON)[0], FAINT)
+
 
 STYLE: dict[str, Any] = {
     "font.family": "sans-serif",

@@ -20,6 +20,7 @@ from hrcreplay.records import FLOOR_Z_M, JOINTS, LIMBS, POINTS, Floats, HumanSta
 from hrcreplay.reporting.figures import planning, prediction
 from hrcreplay.reporting.figures.prediction import Growth, Instant, Sweep, Walk
 from hrcreplay.reporting.figures.scene import LinkPose, Storyboard, StoryScene
+from hrcreplay.reporting.metrics.people import named_volumes
 from hrcreplay.reporting.metrics.planning import numeric_column, position_columns
 from hrcreplay.reporting.metrics.series import find_known_ticks, instants, moment_ns, nearest_tick, times
 from hrcreplay.store.columns import read_states
@@ -36,11 +37,24 @@ _HORIZONS = 7
 X, Y, THETA = (JOINTS.index(name) for name in ("x", "y", "theta"))
 
 
-def compute_fields(run_config: RunConfig, run: Run, fields: Iterable[str]) -> dict[str, Any]:
-    """Computes the fields of ``FigureData`` that are not in the tables; None or empty if the run lacks the data."""
-    wanted = [name for name in dict.fromkeys(fields) if name]
-    people = _states(run_config, run) if wanted else None
-    return {name: _FIELDS[name](run_config, run, people) for name in wanted} if people is not None else {}
+def compute_fields(run_config: RunConfig, run: Run, number: int, fields: Iterable[str]) -> dict[str, Any]:
+    """Computes the fields of ``FigureData`` that are not in the tables; None or empty if the run lacks the data.
+
+    Args:
+        run_config: Configuration of the run.
+        run: Its tables, with all people.
+        number: The person of the figures that show one.
+        fields: Names of the fields.
+    """
+    wanted, one = [name for name in dict.fromkeys(fields) if name], run.of_person(number)
+    people = _states(run_config, one) if wanted else None
+    if people is None:
+        return {}
+    own = people.of_person(number)
+    return {
+        name: _OF_ALL[name](run_config, run, people) if name in _OF_ALL else _OF_ONE[name](run_config, one, own)
+        for name in wanted
+    }
 
 
 def volumes_by_method(run_config: RunConfig, run: Run, people: HumanStates) -> list[Instant]:
@@ -143,7 +157,7 @@ def _sum_m3(volumes: SweptVolumes) -> float:
 
 def story(run_config: RunConfig, run: Run, _people: HumanStates) -> Storyboard | None:
     """Returns the part of the programme around the largest deviation, or else the nearest tick."""
-    motion, alone, occupancy = run.motion, run.baselines.get("none"), run.occupancy
+    motion, alone, occupancy = run.motion, run.baselines.get("none"), named_volumes(run.occupancy)
     if motion is None or alone is None or occupancy is None or run.state is None or run.T_world_base is None:
         return None
     robot = assembly.robot(run_config, run.T_world_base)
@@ -165,10 +179,10 @@ def story(run_config: RunConfig, run: Run, _people: HumanStates) -> Storyboard |
             position_columns(table.iloc[b : i + 1], "tcp")
             for table, b, i in zip((alone, motion), begin, rows, strict=True)
         ]
-        points, _ = prediction.skeleton_at(run.state, at[1])
+        people_m = [prediction.skeleton_at(state, at[1])[0] for state in run.states()]
         scenes.append(
             StoryScene(
-                programme_s, (at[0], at[1]), (ends[0], ends[1]), (ways[0], ways[1]), points, limbs if fresh else {}
+                programme_s, (at[0], at[1]), (ends[0], ends[1]), (ways[0], ways[1]), people_m, limbs if fresh else {}
             )
         )
     if not any(scene.volumes for scene in scenes):
@@ -195,7 +209,12 @@ def nearest_pose(run_config: RunConfig, run: Run, people: HumanStates) -> LinkPo
         return None
     states = _at(people, int(row["t_ns"]))
     horizon_s = float(row["horizon_s"]) if "horizon_s" in row else None
-    hulls = assembly.prediction_stage(run_config).volumes(states, horizon_s).at(0) if len(states) else {}
+    stage = assembly.prediction_stage(run_config)
+    hulls = {
+        assembly.of_person(limb, number): volume
+        for number in np.unique(states.numbers).tolist()
+        for limb, volume in stage.volumes(states.of_person(number), horizon_s).at(0).items()
+    }
     return LinkPose(
         t_ns=int(row["t_ns"]),
         distance_m=float(row["distance_m"]),
@@ -207,14 +226,14 @@ def nearest_pose(run_config: RunConfig, run: Run, people: HumanStates) -> LinkPo
     )
 
 
-_FIELDS: dict[str, Callable[[RunConfig, Run, HumanStates], Any]] = {
+_Field = Callable[[RunConfig, Run, HumanStates], Any]
+_OF_ONE: dict[str, _Field] = {
     "instants": volumes_by_method,
     "walk": fastest_walk,
     "sweep": forearm_sweep,
     "growth": volume_growth,
-    "story": story,
-    "pose": nearest_pose,
 }
+_OF_ALL: dict[str, _Field] = {"story": story, "pose": nearest_pose}
 
 
 def _joints(motion: pd.DataFrame, row: int, axes: int) -> Floats:
@@ -235,7 +254,7 @@ def _fastest_ns(run: Run, span_s: float) -> int | None:
 
 
 def _states(run_config: RunConfig, run: Run) -> HumanStates | None:
-    """Reads the fused person at all ticks that the figures need, once; None without a person."""
+    """Reads the fused people at all ticks that the figures of one of them need, once; None without a person."""
     if run.state is None:
         return None
     wanted_ns = [*instants(run).tolist(), moment_ns(run), _fastest_ns(run, run_config.settings.prediction.stop_s)]
@@ -243,7 +262,7 @@ def _states(run_config: RunConfig, run: Run) -> HumanStates | None:
         wanted_ns.append(int(times(run.motion)[nearest_tick(run.motion)]))
     known_ns = np.array([t for t in wanted_ns if t is not None], dtype=np.int64)
     batches = read_states(run.folder / "state.parquet", 4096)
-    return HumanStates.join([batch.rows(np.isin(batch.t_ns, known_ns)) for batch in batches]).of_person(1)
+    return HumanStates.join([batch.rows(np.isin(batch.t_ns, known_ns)) for batch in batches])
 
 
 def _at(people: HumanStates, wanted_ns: Ints | int) -> HumanStates:

@@ -17,7 +17,7 @@ from matplotlib.ticker import LogLocator
 from scipy.spatial import ConvexHull, QhullError
 
 from hrcreplay.human.model import skeleton
-from hrcreplay.records import JOINTS, LENGTHS, LIMBS, POINTS, Floats, SweptVolume
+from hrcreplay.records import JOINTS, LENGTHS, LIMBS, OF_PERSON, POINTS, Floats, SweptVolume
 from hrcreplay.reporting.figures import drawing
 from hrcreplay.reporting.figures.scene import ABOVE, View, bones, bounds_of, draw_solids, view_from, volume_solids
 from hrcreplay.reporting.metrics.planning import numeric_column
@@ -181,18 +181,19 @@ def stored_at(occupancy: pd.DataFrame, t_ns: int) -> tuple[pd.DataFrame, Limbs]:
     return rows, limbs
 
 
-def volumes_at(occupancy: pd.DataFrame, state: pd.DataFrame, moment_ns: int, t0_ns: int) -> Figure:
-    """Fig. 9: draws the swept volumes that the run used at one instant, from the front of the person and from above.
+def volumes_at(occupancy: pd.DataFrame, people: Sequence[pd.DataFrame], moment_ns: int, t0_ns: int) -> Figure:
+    """Fig. 9: draws the swept volumes that the run used at one instant, from the front of person 1 and from above.
 
     Args:
-        occupancy: Rows of occupancy.parquet.
-        state: The fused person.
+        occupancy: Rows of occupancy.parquet, limbs named with their person.
+        people: The fused states of each person.
         moment_ns: Approximate instant; the volumes stored last before it are drawn [ns].
         t0_ns: Start of the run [ns].
     """
     rows, limbs = stored_at(occupancy, moment_ns)
     t_ns = int(times(rows)[0])
-    points, heading = skeleton_at(state, t_ns)
+    shown = [skeleton_at(state, t_ns) for state in people]
+    heading = shown[0][1]
     figure = drawing.column_figure(2.5)
     (ahead, above), *_ = drawing.column_panels(figure, 1, 2, bottom_in=0.56, gap_in=(0.0, 0.5))
     solids = volume_solids(limbs)
@@ -200,7 +201,8 @@ def volumes_at(occupancy: pd.DataFrame, state: pd.DataFrame, moment_ns: int, t0_
         low, high = bounds_of([solid.outline(view) for solid in solids], 0.03)
         drawing.set_window(ax, low.tolist(), high.tolist())
         draw_solids(ax, solids, view, opacity=0.8, line=0.45)
-        _draw_bones(ax, points, view, np.zeros(2))
+        for points, _ in shown:
+            _draw_bones(ax, points, view, np.zeros(2))
     horizon = f", {rows['horizon_s'].iloc[0]:.2f} s ahead" if "horizon_s" in rows else ""
     ahead.set(title=f"{rows['method'].iloc[0]}{horizon}", xlabel="across [m]", ylabel="up [m]")
     above.set(title=f"{_at(t_ns, t0_ns)}, from above", xlabel="x [m]", ylabel="y [m]")
@@ -280,7 +282,8 @@ def _draw_bones(ax: Axes, points: Floats, view: View, centre: Floats) -> None:
 
 
 def _limb_legend(figure: Figure, drawn: Mapping[str, object] | set[str]) -> None:
-    handles = [Patch(color=colour, lw=0, label=limb) for limb, colour in drawing.LIMBS.items() if limb in drawn]
+    limbs = {name.partition(OF_PERSON)[0] for name in drawn}
+    handles = [Patch(color=colour, lw=0, label=limb) for limb, colour in drawing.LIMBS.items() if limb in limbs]
     figure.legend(
         handles=handles,
         loc="lower center",

@@ -62,6 +62,27 @@ class RenderedHull:
 
 
 @dataclass(frozen=True)
+class RenderedSolid:
+    """A convex solid by its surface, and its colour."""
+
+    surface: tuple[Floats, Ints]  #: (k, 3) corners in the world [m] and (t, 3) outward triangles
+    colour: tuple[float, float, float]
+
+    @property
+    def vertices_m(self) -> Floats:
+        """(k, 3) its corners, world [m]."""
+        return self.surface[0]
+
+    def outline(self, view: View) -> Floats:
+        """(k, 2) outline in a view [m]; empty without a hull."""
+        cloud = view.flat(self.vertices_m)
+        try:
+            return np.asarray(cloud[ConvexHull(cloud).vertices])
+        except (QhullError, ValueError):  # flat, or not known
+            return np.zeros((0, 2))
+
+
+@dataclass(frozen=True)
 class View:
     """An orthographic view: right, up and towards the viewer, each (3,) in the world."""
 
@@ -98,7 +119,9 @@ def _sphere(count: int) -> Floats:
     return np.column_stack([np.cos(around) * np.sin(polar), np.sin(around) * np.sin(polar), np.cos(polar)])
 
 
-def render_hulls(solids: Sequence[RenderedHull], view: View, low: Floats, high: Floats, pixel_m: float) -> Floats:
+def render_hulls(
+    solids: Sequence[RenderedHull | RenderedSolid], view: View, low: Floats, high: Floats, pixel_m: float
+) -> Floats:
     """Renders solids that may intersect: each pixel shows the frontmost surface, lit from above.
 
     Args:
@@ -174,7 +197,7 @@ def volume_solids(limbs: Mapping[str, SweptVolume], moved_m: Floats | None = Non
     """
     origin = np.zeros(3) if moved_m is None else moved_m
     return [
-        RenderedHull(v - origin, r, to_rgb(drawing.LIMBS.get(limb, drawing.FAINT)), FLOOR_Z_M - float(origin[2]))
+        RenderedHull(v - origin, r, to_rgb(drawing.limb_colour(limb)), FLOOR_Z_M - float(origin[2]))
         for limb, (v, r) in limbs.items()
     ]
 
@@ -248,8 +271,8 @@ class StoryScene:
     t_ns: tuple[int, int]  #: times of passing: alone, near the person
     ends_m: tuple[Floats, Floats]  #: (s, 2, 3) each: capsules of the links, world
     tcp_m: tuple[Floats, Floats]  #: (n, 3) each: path of the TCP until then, world
-    points_m: Floats  #: (20, 3) the fused person
-    volumes: Mapping[str, SweptVolume]  #: of the person, by limb
+    people_m: Sequence[Floats]  #: (20, 3) each: the fused people
+    volumes: Mapping[str, SweptVolume]  #: of the people, by limb
 
 
 @dataclass(frozen=True)
@@ -328,7 +351,7 @@ def _draw_scene(ax: Axes, scene: StoryScene, side: int, story: Storyboard, view:
     draw_objects(ax, story.objects, view)
     if side:
         draw_outlines(ax, scene.volumes, view)
-        for pair in bones(scene.points_m, view):
+        for pair in (pair for points_m in scene.people_m for pair in bones(points_m, view)):
             ax.plot(*pair.T, color=drawing.INK, lw=1.0, zorder=1)
     draw_solids(ax, _robot(scene.ends_m[side], story), view, line=0.4)
     ax.plot(*view.flat(thin_path(story.reference_m, 0.004)).T, color=drawing.NOMINAL, lw=0.9, zorder=4)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
+from hrcreplay.pipeline.assembly import of_person
 from hrcreplay.reporting.metrics.contact import method_prefixes
 from hrcreplay.reporting.metrics.planning import numeric_column
 from hrcreplay.reporting.metrics.series import MetricTable, times
@@ -12,6 +13,14 @@ from hrcreplay.store.run_folder import Run
 
 #: Name of the metric that counts them, where there are several.
 TRACKED = "people_tracked"
+
+
+def named_volumes(occupancy: pd.DataFrame | None) -> pd.DataFrame | None:
+    """Returns the volumes of all people, each limb named with its person; the table itself for one person."""
+    if occupancy is None or "person" not in occupancy:
+        return occupancy
+    pairs = zip(occupancy["limb"].astype(str), occupancy["person"].tolist(), strict=True)
+    return occupancy.assign(limb=[of_person(limb, number) for limb, number in pairs])
 
 
 def add_people(metrics: MetricTable, run: Run) -> None:

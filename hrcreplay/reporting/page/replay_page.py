@@ -11,7 +11,7 @@ import base64
 import json
 import math
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib import resources
 from typing import Any
@@ -25,24 +25,35 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from hrcreplay.geometry.distances import nearest_pair
 from hrcreplay.records import Floats, Ints, SweptVolume
 from hrcreplay.reporting.figures import drawing
-from hrcreplay.reporting.figures.drawing import BONES
-from hrcreplay.reporting.figures.scene import RenderedHull, View, bounds_of, render_hulls, view_from, volume_solids
+from hrcreplay.reporting.figures.scene import (
+    RenderedHull,
+    RenderedSolid,
+    View,
+    bounds_of,
+    render_hulls,
+    view_from,
+    volume_solids,
+)
 from hrcreplay.reporting.metrics.series import seconds_from
 from hrcreplay.reporting.replay_scene import (
     RATE_HZ,
-    SHOWN_POINTS,
     VOLUME_HZ,
     MethodTrack,
     ReplayScene,
+    RobotGeometry,
     VolumeTrack,
     at_rate,
+    placements,
     pose_links,
 )
 from hrcreplay.reporting.scene_messages import whole_surface
 from hrcreplay.reporting.tables import part_name_text, reason_text
+from hrcreplay.reporting.tour import telling_moment, tour
 from hrcreplay.robot.control.static_obstacles import StaticHull
 
 #: Modules that the browser imports by name, and their files.
@@ -64,14 +75,17 @@ LAYERS = (
     ("stop", "stop", "end of the robot's stop"),
     ("paths", "driven", "paths"),
     ("distance", "toBody", "distances"),
+    ("cameras", "soft", "cameras"),
 )
 MESHES = ("meshes", "robot", "meshes of the links")  #: the same, for a robot with meshes
 ROBOT_LEGEND = {
-    False: "Orange: the robot as the capsules that its distances are measured from",
-    True: "Orange: the robot, in the shell of the capsules that its distances are measured from",
+    False: "Orange: the robot as the capsules that its distances are measured from; red, with what it touches, in "
+    "contact",
+    True: "Orange: the robot, in the shell of the capsules that its distances are measured from; red, with what it "
+    "touches, in contact",
 }
 LEGEND = (
-    "red: end of the stop that it could begin at that instant, and the path of its TCP until then. Blue: the "
+    "green: end of the stop that it could begin at that instant, and the path of its TCP until then. Blue: the "
     "recorded body; the dark lines in it are the person as fused from the cameras. Yellow: space that the person "
     "could reach until the robot would have stopped. Blue line: programmed path; orange line: driven path. Violet: "
     "from the "
@@ -204,7 +218,7 @@ def _header(scene: ReplayScene) -> dict[str, Any]:
         "rate_hz": RATE_HZ,
         "count": len(scene.t_ns),
         "start_s": round((int(scene.t_ns[0]) - scene.t0_ns) * 1e-9, 6),
-        "bones": [[SHOWN_POINTS.index(a), SHOWN_POINTS.index(b)] for a, b in BONES],
+        "bones": scene.bones.tolist(),
         "body": {
             "parts": [part_name_text(part) for part in scene.body_parts],
             "radius_m": scene.body_radius_m.tolist(),
@@ -217,7 +231,7 @@ def _header(scene: ReplayScene) -> dict[str, Any]:
             "screws": robot.screws.tolist(),
             "tcp_m": robot.tcp_m.tolist(),
             "base_m": robot.base_m.tolist(),
-            "meshes": [mesh.link for mesh in robot.meshes],
+            "meshes": [{"link": mesh.link, "axes": robot.axes_of(mesh)} for mesh in robot.meshes],
         },
         "methods": {
             name: {
@@ -228,7 +242,21 @@ def _header(scene: ReplayScene) -> dict[str, Any]:
         },
         "order": list(scene.methods),
         "watched": scene.watched_m.tolist(),
+        "cameras": [
+            {"name": one.name, "corners": np.round(one.corners_m(_VIEW_DEPTH_M), 4).tolist()} for one in scene.cameras
+        ],
+        **_moments(scene),
         **({"objects": [_object(one) for one in scene.objects]} if scene.objects else {}),
+    }
+
+
+def _moments(scene: ReplayScene) -> dict[str, Any]:
+    """Returns the instant that the page opens with, the method beside the run's own, and the tour."""
+    moment = telling_moment(scene)
+    return {
+        "open_s": round(float(scene.seconds[moment.row]), 4),
+        "beside": moment.beside,
+        "tour": [{**asdict(stop), "words": stop.words} for stop in tour(scene)],
     }
 
 
@@ -289,21 +317,23 @@ def _hulls(hulls: VolumeTrack) -> NumberBlock:
     return block
 
 
-_ROBOT, _PERSON = "#d9823b", "#7fb2d9"
+_ROBOT, _PERSON, _TOUCH = "#d9823b", "#7fb2d9", "#c62828"
+#: Depth of the drawn view of a camera [m].
+_VIEW_DEPTH_M = 0.35
 #: Time around the instant in which paths are drawn [s].
 _PATH_S = 8.0
 _MARGIN_M = 0.12
 
 
 def snapshot(scene: ReplayScene, row: int) -> Figure:
-    """Draws the scene of the run's own method at an instant, with robot and person side by side.
+    """Draws the scene of the run's own method at an instant, from where people hide the least of the robot.
 
     Args:
         scene: The scene.
         row: Index of the instant.
     """
     name, track = next(iter(scene.methods.items()))
-    view = view_from(_beside(scene, row), 0.18)
+    view = view_from(clearest_azimuth(scene, [row], [name]), ELEVATION_RAD)
     figure = drawing.new_figure(6.2)
     axes = drawing.panels(figure, 1, 1, left_in=0.62, top_in=0.62, bottom_in=0.75)[0][0]
     low, high = bounds_of([solid.outline(view) for solid in (*solids(scene, row), *reach(scene, row))], _MARGIN_M)
@@ -315,16 +345,65 @@ def snapshot(scene: ReplayScene, row: int) -> Figure:
     return figure
 
 
-def solids(scene: ReplayScene, row: int) -> list[RenderedHull]:
-    """The robot of the run's own method and the recorded person at an instant, as far as they are known."""
-    track = next(iter(scene.methods.values()))
-    ends = pose_links(scene.robot, track.q[row : row + 1])[0]
-    robot = [RenderedHull(pair, float(r), to_rgb(_ROBOT)) for pair, r in zip(ends, scene.robot.radius_m, strict=True)]
+def solids(scene: ReplayScene, row: int, method: str | None = None) -> list[RenderedHull | RenderedSolid]:
+    """Returns a robot and the recorded people at an instant, as far as they are known; in red what touches.
+
+    Args:
+        scene: The scene.
+        row: Index of the instant.
+        method: Method of the robot; None: the run's own.
+    """
+    q = scene.methods[method or next(iter(scene.methods))].q[row]
+    ends, radius_m = pose_links(scene.robot, q[None])[0], scene.robot.radius_m
+    touching = touching_pairs(ends, radius_m, scene.body_m[row], scene.body_radius_m)
+    links, parts = ({pair[side] for pair in touching} for side in (0, 1))
     person = [
-        RenderedHull(pair, float(r), to_rgb(_PERSON))
-        for pair, r in zip(scene.body_m[row], scene.body_radius_m, strict=True)
+        RenderedHull(pair, float(r), to_rgb(_TOUCH if part in parts else _PERSON))
+        for part, (pair, r) in enumerate(zip(scene.body_m[row], scene.body_radius_m, strict=True))
     ]
-    return [solid for solid in (*robot, *person) if np.isfinite(solid.vertices_m).all()]
+    found: list[RenderedHull | RenderedSolid] = [*_robot_solids(scene.robot, q, ends, links), *person]
+    return [solid for solid in found if np.isfinite(solid.vertices_m).all()]
+
+
+def _robot_solids(
+    robot: RobotGeometry, q: Floats, ends_m: Floats, touching: set[int]
+) -> list[RenderedHull | RenderedSolid]:
+    """Returns the robot by its own solids, and by the capsules of the links that those do not show."""
+    colours = [to_rgb(_TOUCH if link in touching else _ROBOT) for link in range(len(robot.links))]
+    if not robot.solids or not np.isfinite(q).all():
+        return [RenderedHull(e, float(r), c) for e, r, c in zip(ends_m, robot.radius_m, colours, strict=True)]
+    link_of = {robot.axes_of(mesh): mesh.link for mesh in robot.meshes}
+    poses = [(Rotation.identity(), np.zeros(3)), *((turn[0], at_m[0]) for turn, at_m in placements(robot, q[None]))]
+    own: list[RenderedHull | RenderedSolid] = []
+    for one in robot.solids:
+        turn, at_m = poses[one.axes]
+        link = link_of[one.axes]
+        own.append(
+            RenderedSolid(
+                (turn.apply(one.vertices_m) + at_m, one.triangles), colours[link] if link >= 0 else to_rgb(_ROBOT)
+            )
+        )
+    bare = [link for link in range(len(robot.links)) if link not in link_of.values()]
+    return own + [RenderedHull(ends_m[k], float(robot.radius_m[k]), colours[k]) for k in bare]
+
+
+def touching_pairs(ends_m: Floats, radius_m: Floats, body_m: Floats, body_radius_m: Floats) -> list[tuple[int, int]]:
+    """Returns the pairs of a link and a part of a body whose capsules overlap.
+
+    Args:
+        ends_m: (s, 2, 3) ends of the links' axes [m].
+        radius_m: (s,) their radii [m].
+        body_m: (p, 2, 3) ends of the axes of the parts; NaN if unknown [m].
+        body_radius_m: (p,) their radii [m].
+    """
+    found = []
+    for part in np.flatnonzero(np.isfinite(body_m).all(axis=(1, 2))).tolist():
+        for link in range(len(ends_m)):
+            one, other = (slice(k, k + 1) for k in (link, part))
+            pair = nearest_pair(ends_m[None, one], radius_m[one], body_m[None, other], body_radius_m[other])
+            if pair.distance_m[0] <= 0.0:
+                found.append((link, part))
+    return found
 
 
 def reach(scene: ReplayScene, row: int) -> list[RenderedHull]:
@@ -332,7 +411,9 @@ def reach(scene: ReplayScene, row: int) -> list[RenderedHull]:
     return volume_solids(_stored(scene, row))
 
 
-def draw_instant(axes: Axes, scene: ReplayScene, row: int, view: View, *, since: int | None = None) -> None:
+def draw_instant(
+    axes: Axes, scene: ReplayScene, row: int, view: View, *, since: int | None = None, method: str | None = None
+) -> None:
     """Draws swept volumes, robot, person and paths at an instant, on axes whose window is set.
 
     Args:
@@ -341,14 +422,15 @@ def draw_instant(axes: Axes, scene: ReplayScene, row: int, view: View, *, since:
         row: Which of its instants.
         view: From where.
         since: Instant that the driven path begins with; None: some seconds before.
+        method: Method of the robot; None: the run's own.
     """
-    track = next(iter(scene.methods.values()))
+    track = scene.methods[method or next(iter(scene.methods))]
     for one in scene.objects:
         edge = RenderedHull(one.vertices_m, one.radius_m, to_rgb(drawing.FAINT)).outline(view)
         axes.add_patch(Polygon(edge, facecolor=drawing.FAINT, edgecolor=drawing.INK, alpha=0.25, lw=0.5, zorder=0))
     for edge in (solid.outline(view) for solid in reach(scene, row)):
         axes.add_patch(Polygon(edge, facecolor=drawing.ORANGE, edgecolor=drawing.ORANGE, alpha=0.16, lw=0.7, zorder=1))
-    shown = solids(scene, row)
+    shown = solids(scene, row, method)
     low, high = bounds_of([solid.outline(view) for solid in shown], _MARGIN_M)
     image = render_hulls(shown, view, low, high, float(np.diff(axes.get_ylim())[0]) / 700.0)
     limits = axes.get_xlim(), axes.get_ylim()
@@ -399,12 +481,59 @@ def _stored(scene: ReplayScene, row: int) -> dict[str, SweptVolume]:
     }
 
 
-def _beside(scene: ReplayScene, row: int) -> float:
-    """Returns the azimuth of a view with robot and person side by side [rad]."""
-    known = scene.body_m[row] if len(scene.body_parts) else scene.points_m[row]
-    person = known.reshape(-1, 3)
-    person = person[np.isfinite(person).all(axis=1)]
-    if not len(person):
+#: How far the viewer looks down [rad], and directions that are tried.
+ELEVATION_RAD, _DIRECTIONS = 0.3, 36
+#: Weight of a view along the line from robot to person beside the share of the robot that is hidden.
+_AHEAD = 0.3
+
+
+def clearest_azimuth(scene: ReplayScene, rows: Sequence[int], methods: Sequence[str]) -> float:
+    """Returns the azimuth from which people hide the least of the robots, with both side by side [rad].
+
+    Args:
+        scene: The scene.
+        rows: Instants that count.
+        methods: Methods whose robots count.
+    """
+    points, people, towards = [], [], np.zeros(3)
+    for row in rows:
+        body = scene.body_m[row]
+        known = np.isfinite(body).all(axis=(1, 2))
+        if not known.any():
+            body = scene.points_m[row][:, None].repeat(2, axis=1)
+            known = np.isfinite(body).all(axis=(1, 2))
+        if known.any():
+            towards = towards + body[known].mean(axis=(0, 1)) - scene.robot.base_m
+        for method in methods:
+            ends = pose_links(scene.robot, scene.methods[method].q[row : row + 1])[0]
+            points.append(np.concatenate([ends[:, 0], ends.mean(axis=1), ends[:, 1]]))
+            people.append((scene.body_m[row], scene.body_radius_m))
+    level = float(np.hypot(*towards[:2]))
+    if level == 0.0:
         return -0.5 * np.pi
-    towards = person.mean(axis=0) - scene.robot.base_m
-    return float(np.arctan2(towards[1], towards[0]) - 0.5 * np.pi)
+    azimuths = 2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
+    ahead = np.abs(np.cos(azimuths - np.arctan2(towards[1], towards[0])))
+    hidden = [
+        np.mean(
+            [
+                _hidden(p, body, r, view_from(azimuth, ELEVATION_RAD))
+                for p, (body, r) in zip(points, people, strict=True)
+            ]
+        )
+        for azimuth in azimuths.tolist()
+    ]
+    return float(azimuths[int(np.argmin(np.round(np.array(hidden) + _AHEAD * ahead, 9)))])
+
+
+def _hidden(points_m: Floats, body_m: Floats, radius_m: Floats, view: View) -> float:
+    """Returns the share of points (n, 3) that capsules of a body hide in a view; unknown points are not counted."""
+    points_m = points_m[np.isfinite(points_m).all(axis=1)]
+    known = np.isfinite(body_m).all(axis=(1, 2))
+    if not len(points_m) or not known.any():
+        return 0.0
+    sight = np.stack([points_m, points_m + 4.0 * view.toward], axis=1)
+    near = [
+        nearest_pair(sight[:, None], np.zeros(1), np.repeat(part[None, None], len(sight), axis=0), np.array([radius]))
+        for part, radius in zip(body_m[known], radius_m[known], strict=True)
+    ]
+    return float((np.min([pair.distance_m for pair in near], axis=0) < 0.0).mean())

@@ -15,7 +15,7 @@ from markupsafe import Markup
 
 from hrcreplay.records import LIMBS, RECORDED
 from hrcreplay.reporting import summary_text
-from hrcreplay.reporting.figures.catalogue import FIGURES
+from hrcreplay.reporting.figures.catalogue import FIGURES, FigureKind, file_name
 from hrcreplay.reporting.metrics.fusion import cameras
 from hrcreplay.reporting.metrics.series import Metric
 from hrcreplay.reporting.page.replay_page import replay_part
@@ -73,6 +73,7 @@ def render(
     stops: Sequence[PageTable] = (),
     title: str = "",
     scene: ReplayScene | None = None,
+    people: Sequence[int] = (1,),
 ) -> str:
     """Renders the page of a run.
 
@@ -84,6 +85,7 @@ def render(
         stops: The longest stops, shown with the safety.
         title: Name of the session; none: the name of the first input.
         scene: Content of the 3-D replay; None: without a replay.
+        people: Numbers of the people in the run.
 
     Returns:
         HTML without requests, times or paths.
@@ -100,7 +102,7 @@ def render(
         replay=None if scene is None else replay_part(scene),
         answers=summary_text.answers(run, metrics),
         cards=summary_text.cards(run, metrics),
-        parts=_parts(run, metrics, figures_dir, tables, stops),
+        parts=_parts(run, metrics, figures_dir, tables, stops, people),
         settings=_settings(run.meta.get("settings", {})),
         inputs=inputs,
         versions=sorted(run.meta.get("versions", {}).items()),
@@ -131,17 +133,18 @@ def _parts(
     figures_dir: Path,
     tables: Sequence[PageTable],
     stops: Sequence[PageTable],
+    people: Sequence[int],
 ) -> tuple[PageSection, ...]:
     seen = cameras(run)
     with_truth = metrics["fusion_angle_rmse"]["value"] is not None
     return (
-        *_plan(run, metrics, figures_dir, stops),
-        *_robot(run, _figures(figures_dir, "robot")),
+        *_plan(run, metrics, figures_dir, stops, people),
+        *_robot(run, _figures(figures_dir, "robot", people)),
         PageSection(
             "prediction",
             "Prediction",
             "The space that the person could reach until the robot would have stopped, and the bounds behind it.",
-            _figures(figures_dir, "prediction"),
+            _figures(figures_dir, "prediction", people),
             (*_volumes(metrics), *tables),
             ""
             if run.occupancy is not None
@@ -151,7 +154,7 @@ def _parts(
             "fusion",
             "Fusion",
             "The person as each camera saw them, and as the filter has them.",
-            _figures(figures_dir, "fusion"),
+            _figures(figures_dir, "fusion", people),
             (_fusion_table(metrics, seen),) if with_truth else (),
             "" if with_truth else "The log has no ground truth, so there are no errors.",
         ),
@@ -159,7 +162,7 @@ def _parts(
             "data",
             "Data quality",
             "Content of the log, and its defects.",
-            _figures(figures_dir, "data"),
+            _figures(figures_dir, "data", people),
             (
                 compare("Cameras", metrics, {name: f"camera_{name}" for name in seen}, CAMERA),
                 *agreement_table(run.agreement),
@@ -170,19 +173,32 @@ def _parts(
     )
 
 
-def _figures(folder: Path, section: str) -> tuple[PageFigure, ...]:
-    """Returns the drawn figures of a section."""
-    found = [kind for kind in FIGURES if kind.section == section and (folder / f"{kind.name}.svg").is_file()]
+def _figures(folder: Path, section: str, people: Sequence[int] = (1,)) -> tuple[PageFigure, ...]:
+    """Returns the drawn figures of a section; those of one person for each of ``people``."""
+    found = [
+        (name, _caption(kind, number, len(people)))
+        for kind in FIGURES
+        if kind.section == section
+        for number in people
+        if (folder / f"{(name := file_name(kind, number))}.svg").is_file()
+    ]
     return tuple(
-        PageFigure(
-            kind.name, kind.caption, inline_svg(folder / f"{kind.name}.svg", kind.name, kind.caption), wide=False
-        )
-        for kind in found
+        PageFigure(name, caption, inline_svg(folder / f"{name}.svg", name, caption), wide=False)
+        for name, caption in found
     )
 
 
+def _caption(kind: FigureKind, number: int, count: int) -> str:
+    """Returns the caption of a figure, with the person whom it shows if there are several."""
+    return f"Person {number}. {kind.caption}" if count > 1 and (kind.one or kind.each) else kind.caption
+
+
 def _plan(
-    run: Run, metrics: Mapping[str, Metric], figures_dir: Path, stops: Sequence[PageTable]
+    run: Run,
+    metrics: Mapping[str, Metric],
+    figures_dir: Path,
+    stops: Sequence[PageTable],
+    people: Sequence[int],
 ) -> tuple[PageSection, ...]:
     """Makes the sections on the plan and its baselines: safety, and cost to the task."""
     plans = {"this plan": "plan", **{name: f"baseline_{name}" for name in sorted(run.baselines)}}
@@ -194,7 +210,7 @@ def _plan(
             "safety",
             "Safety",
             "Speed of the robot, distance from the space that the person could reach, and constraints that slowed it.",
-            _figures(figures_dir, "safety"),
+            _figures(figures_dir, "safety", people),
             (
                 compare("Safety, per method on the same volumes", metrics, ran | plans, PLAN_SAFETY),
                 *_reasons(metrics, plans),
@@ -208,7 +224,7 @@ def _plan(
             "cost",
             "Cost to the task",
             "Share of standstill, deviation from the path, and time lost.",
-            _figures(figures_dir, "cost"),
+            _figures(figures_dir, "cost", people),
             (compare("Cost, per method on the same volumes", metrics, plans, PLAN_COST, _papers(metrics)),)
             if planned
             else (),

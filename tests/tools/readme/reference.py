@@ -26,7 +26,7 @@ ERRORS = {
     "audit": ("audit", "evaluation", "commands/audit.py"),
     "live": ("live", "egm/link.py"),
     "twin": ("egm",),
-    "command": ("commands", "cli", "store", "api.py"),
+    "command": ("commands", "reporting", "cli", "store", "api.py"),
 }
 _ERRORS = ("SettingsError", "LogError")
 #: What these say is wrong with a value is shown behind the place of the value.

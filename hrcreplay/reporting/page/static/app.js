@@ -5,13 +5,14 @@ import { ReplayView } from "replay/scene";
 
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 5, 10];
 const COLOURS = ["stage", "grid", "gridMain", "robot", "stop", "person", "volume", "base", "bones", "programmed", "driven", "stopPath", "toBody", "toVolume", "soft", "line", "braking", "touch"];
+const WIDE_PX = 720; // from this width of the stage on, two methods stand side by side when the page opens
 
 export async function start(root) {
   const data = await load(root);
   const $ = (selector) => root.querySelector(selector);
   const { header } = data;
   const end_s = header.start_s + (header.count - 1) / header.rate_hz;
-  const state = { t_s: header.start_s, method: header.order[0], playing: false, speed: 1 };
+  const state = { t_s: header.open_s, method: header.order[0], beside: null, playing: false, speed: 1, tour: null };
   const view = new ReplayView($("canvas"), data, colours());
   const plots = new Plots($(".plots"), data, (t_s) => seek(t_s));
 
@@ -29,23 +30,29 @@ export async function start(root) {
   // The first row of the data is start_s.
   const row = () => (state.t_s - header.start_s) * header.rate_hz;
   const events = () => header.methods[state.method].events;
-  const text = (kind) => {
-    const index = nearest(data.motion(`${state.method}/${kind}`), Math.floor(row() + 1e-6));
-    return index >= 0 ? header.methods[state.method].names[kind][index] : "";
+  const text = (method, kind) => {
+    const index = nearest(data.motion(`${method}/${kind}`), Math.floor(row() + 1e-6));
+    return index >= 0 ? header.methods[method].names[kind][index] : "";
   };
-  const number = (name) => nearest(data.motion(`${state.method}/${name}`), Math.floor(row() + 1e-6));
+  const number = (method, name) => nearest(data.motion(`${method}/${name}`), Math.floor(row() + 1e-6));
+  // As the tables of the page: millimetres, milliseconds below a second, else tenths.
   const metresPerSecond = (x, programmed) =>
-    Number.isFinite(x) ? `${x.toFixed(2)}${Number.isFinite(programmed) ? ` of ${programmed.toFixed(2)}` : ""} m/s` : "not known";
-  const centimetres = (x) => (Number.isFinite(x) ? `${Math.round(100 * x)} cm` : "not known");
+    Number.isFinite(x) ? `${x.toFixed(3)}${Number.isFinite(programmed) ? ` of ${programmed.toFixed(3)}` : ""} m/s` : "not known";
+  const metres = (x) => (Number.isFinite(x) ? `${x.toFixed(3)} m` : "not known");
+  const duration = (x) => (x < 1 ? `${Math.round(1000 * x)} ms` : `${x.toFixed(1)} s`);
+  const shown = () => (state.beside === null ? [state.method] : [state.method, state.beside]);
+  const title = (method) => (method === header.order[0] ? `${method} (this plan)` : method);
+  view.told = label;
 
   function draw() {
-    const near = view.show(state.method, row(), state.t_s);
-    view.render();
+    const near = view.draw(shown(), row(), state.t_s);
     $(".scrub").value = state.t_s;
     $(".scrub").setAttribute("aria-valuetext", `${state.t_s.toFixed(2)} seconds`);
     $(".clock").textContent = `${state.t_s.toFixed(2)} s`;
     plots.mark(state.t_s);
-    tell(near);
+    tell(".readout", state.method, near[0]);
+    $(".readout.other").hidden = state.beside === null;
+    if (state.beside !== null) tell(".readout.other", state.beside, near[1]);
     const current = lastNotAfter(events().map((event) => event.at_s), state.t_s + 1e-3);
     if (current === state.current) return;
     state.current = current;
@@ -55,24 +62,44 @@ export async function start(root) {
     if (now) list.scrollTop = now.offsetTop - list.offsetTop - list.clientHeight / 3; // the list alone, not the page
   }
 
-  function tell(near) {
-    const status = text("status"), reason = text("reason");
+  // The names of the methods, and what touches, over each picture.
+  function label(near) {
+    const wide = 100 / near.length;
+    root.querySelectorAll(".picture").forEach((picture, k) => {
+      picture.hidden = k >= near.length;
+      if (picture.hidden) return;
+      Object.assign(picture.style, { left: `${k * wide}%`, width: `${wide}%` });
+      picture.querySelector(".picture-title").textContent = title(shown()[k]);
+      const touch = picture.querySelector(".picture-touch"), touching = near[k].touching.length > 0;
+      touch.hidden = !touching;
+      if (!touching) return;
+      touch.textContent = `contact: ${near[k].body.link} – ${near[k].body.limb}`;
+      const { x, y } = view.onScreen(near[k].body.from);
+      Object.assign(touch.style, { left: `${100 * Math.max(0.02, Math.min(0.6, x))}%`, top: `${100 * Math.max(0.1, Math.min(0.85, y + 0.06))}%` });
+    });
+  }
+
+  function tell(where, method, near) {
+    const status = text(method, "status"), reason = text(method, "reason");
+    const body_m = number(method, "body_m");
     const lines = [
+      ["method", title(method)],
       ["status", status + (reason && status !== "tracking" ? ` (${reason})` : "")],
-      ["speed", metresPerSecond(number("tcp_speed"), number("ref_speed"))],
-      ["to the body", near.body ? `${centimetres(number("body_m"))}: ${near.body.link} – ${near.body.limb}` : "not known"],
-      ["to the volumes", centimetres(number("distance_m"))],
-      ["predicted for", Number.isFinite(number("horizon_s")) ? `${Math.round(1000 * number("horizon_s"))} ms` : "–"],
+      ["speed", metresPerSecond(number(method, "tcp_speed"), number(method, "ref_speed"))],
+      [near.touching.length ? "in contact" : "to the body", near.body ? `${metres(body_m)}: ${near.body.link} – ${near.body.limb}` : "not known"],
+      ["to the volumes", metres(number(method, "distance_m"))],
+      ["predicted for", Number.isFinite(number(method, "horizon_s")) ? duration(number(method, "horizon_s")) : "–"],
     ];
-    const certified = number("certified");
+    const certified = number(method, "certified");
     if (certified >= 0) lines.push(["stop", certified ? "certified" : "not certified"]);
-    $(".readout").replaceChildren(...lines.flatMap(([name, value]) => {
+    $(where).classList.toggle("in-touch", near.touching.length > 0);
+    $(where).replaceChildren(...lines.flatMap(([name, value]) => {
       const dt = document.createElement("dt"), dd = document.createElement("dd");
       dt.textContent = name;
       dd.textContent = value;
       return [dt, dd];
     }));
-    $(".readout").dataset.status = status;
+    $(where).dataset.status = status;
   }
 
   function seek(t_s) {
@@ -85,12 +112,48 @@ export async function start(root) {
     if (!state.playing) return;
     const passed_s = before_ms === null ? 0 : Math.min(0.25, (now_ms - before_ms) / 1000);
     before_ms = now_ms;
-    if (state.t_s >= end_s) return play(false);
-    seek(state.t_s + state.speed * passed_s);
+    if (state.t_s >= end_s && state.tour === null) return play(false);
+    if (!tourGoesOn()) return;
+    seek(Math.min(state.t_s + state.speed * passed_s, state.tour === null ? end_s : header.tour[state.tour].until_s));
     requestAnimationFrame(tick);
   }
 
+  // The worst moments one after the other, at their pace, each beside the method that tells most there.
+  function startTour() {
+    if (!header.tour.length) return;
+    play(true);
+    speed(1);
+    visit(0);
+  }
+
+  function visit(stop) {
+    const { from_s, beside, words } = header.tour[stop];
+    state.tour = stop;
+    $(".caption").textContent = `${stop + 1} of ${header.tour.length}. ${words}`;
+    $(".caption").hidden = false;
+    if (wide()) state.beside = beside;
+    choose(header.order[0]);
+    seek(from_s);
+  }
+
+  // Goes to the next stop at the end of one; false at the end of the tour.
+  function tourGoesOn() {
+    if (state.tour === null || state.t_s < header.tour[state.tour].until_s - 1e-6) return true;
+    if (state.tour + 1 < header.tour.length) {
+      visit(state.tour + 1);
+      return true;
+    }
+    play(false);
+    return false;
+  }
+
+  function endTour() {
+    state.tour = null;
+    $(".caption").hidden = true;
+  }
+
   function play(on) {
+    if (!on || state.tour !== null) endTour();
     if (on && state.t_s >= end_s) state.t_s = header.start_s;
     state.playing = on;
     before_ms = null;
@@ -116,21 +179,31 @@ export async function start(root) {
   }
 
   function choose(method) {
-    state.method = method;
+    const again = method === state.listed;
+    state.method = state.listed = method;
     $(".method").value = method;
-    listStops();
-    plots.show(method, colours(), events());
-    $(".volumes-note").hidden = method === header.order[0];
+    $(".beside").value = state.beside ?? "";
+    if (!again) {
+      listStops();
+      plots.show(method, colours(), events());
+    }
+    $(".volumes-note").hidden = shown().every((name) => name === header.order[0]);
     draw();
   }
+
+  function putBeside(method) {
+    state.beside = method || null;
+    choose(state.method);
+  }
+  const wide = () => $(".stage").clientWidth >= WIDE_PX;
 
   function listStops() {
     state.current = null;
     const words = (event) => {
       const pair = event.link && event.limb ? `${event.link} – ${event.limb}` : event.link || event.limb;
-      if (event.kind === "touch") return `touched: ${pair}, ${event.moving_s.toFixed(2)} s, up to ${event.speed_m_per_s.toFixed(2)} m/s`;
-      const rest = event.rest_s > 0 ? `, then stood ${event.rest_s.toFixed(1)} s` : "";
-      return `braked ${event.moving_s.toFixed(2)} s from ${event.speed_m_per_s.toFixed(2)} m/s${rest}: ${[event.reason, pair].filter(Boolean).join(", ")}`;
+      if (event.kind === "touch") return `touched: ${pair}, ${duration(event.moving_s)}, up to ${event.speed_m_per_s.toFixed(3)} m/s`;
+      const rest = event.rest_s > 0 ? `, then stood ${duration(event.rest_s)}` : "";
+      return `braked ${duration(event.moving_s)} from ${event.speed_m_per_s.toFixed(3)} m/s${rest}: ${[event.reason, pair].filter(Boolean).join(", ")}`;
     };
     $(".stops ol").replaceChildren(...events().map((event) => {
       const item = document.createElement("li"), button = document.createElement("button");
@@ -162,6 +235,8 @@ export async function start(root) {
     n: () => jump(1),
     p: () => jump(-1),
     m: () => choose(header.order[(header.order.indexOf(state.method) + 1) % header.order.length]),
+    b: () => putBeside([null, ...header.order][([null, ...header.order].indexOf(state.beside) + 1) % (header.order.length + 1)]),
+    t: () => startTour(),
   };
   // The keys are the replay's while it is on the screen and nothing else on the page wants them.
   function key(event) {
@@ -188,15 +263,21 @@ export async function start(root) {
     view.home();
     view.render();
   });
+  $(".tour").addEventListener("click", startTour);
+  $(".tour").hidden = !header.tour.length;
+  $(".beside").replaceChildren(new Option("nothing", ""), ...header.order.map((name) => new Option(title(name), name)));
+  $(".beside").addEventListener("change", (event) => putBeside(event.target.value));
   $(".speed").replaceChildren(...SPEEDS.map((value) => new Option(`${value}×`, value, value === 1, value === 1)));
   $(".speed").addEventListener("change", (event) => speed(Number(event.target.value)));
-  $(".method").replaceChildren(...header.order.map((name, k) => new Option(k ? name : `${name} (this plan)`, name)));
+  $(".method").replaceChildren(...header.order.map((name) => new Option(title(name), name)));
   $(".method").addEventListener("change", (event) => choose(event.target.value));
   root.querySelectorAll("input[data-show]").forEach((box) => box.addEventListener("change", () => {
     view.shown[box.dataset.show] = box.checked;
     view.stored = null;
     draw();
   }));
+  $(".plots").addEventListener("zoom", (event) => ($(".whole").hidden = event.detail === null));
+  $(".whole").addEventListener("click", () => plots.zoom(null));
   addEventListener("keydown", key);
   document.documentElement.addEventListener("themechange", () => {
     view.paint(colours());
@@ -208,6 +289,8 @@ export async function start(root) {
     view.resize(clientWidth, clientHeight);
     plots.resize();
   }).observe($(".stage"));
+  if (wide()) state.beside = header.beside;
+  view.drawn = { methods: shown(), at: row(), t_s: state.t_s };
   view.resize($(".stage").clientWidth, $(".stage").clientHeight);
   view.home();
   const { rate_hz } = data.volumes;
@@ -216,5 +299,5 @@ export async function start(root) {
     : "The volumes of this run do not fit on the page: occupancy.parquet holds them.";
   choose(state.method);
   root.classList.add("replay-ready");
-  window.replay = { state, seek, choose, play, view, data }; // for tests, and for the curious
+  window.replay = { state, seek, choose, play, putBeside, startTour, view, plots, data }; // for tests, and for the curious
 }

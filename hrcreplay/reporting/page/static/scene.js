@@ -43,7 +43,7 @@ class Capsules {
 // Surfaces of links, where the turned axes bring them.
 class Surfaces {
   constructor(robot, motion, material) {
-    this.moved_by = robot.meshes.map((link) => robot.moved_by[link]);
+    this.meshes = robot.meshes;
     this.group = new THREE.Group();
     robot.meshes.forEach((_, k) => {
       const geometry = new THREE.BufferGeometry();
@@ -57,11 +57,22 @@ class Surfaces {
 
   show(placements) {
     this.group.children.forEach((mesh, k) => {
-      mesh.matrix.copy(placements[this.moved_by[k]]);
+      mesh.matrix.copy(placements[this.meshes[k].axes]);
       mesh.visible = mesh.matrix.elements.every(Number.isFinite);
       mesh.matrixWorldNeedsUpdate = true;
     });
   }
+
+  // Gives the meshes of some links another material.
+  mark(links, marked, plain) {
+    this.group.children.forEach((mesh, k) => (mesh.material = links.has(this.meshes[k].link) ? marked : plain));
+  }
+}
+
+// The edges of a pyramid, given its tip and the corners of its base.
+function edges([tip, ...base]) {
+  const at = (corner) => new THREE.Vector3(...corner);
+  return base.flatMap((corner, k) => [at(tip), at(corner), at(corner), at(base[(k + 1) % base.length])]);
 }
 
 // A line with a width: a rod for each piece that is long enough to be seen.
@@ -146,13 +157,15 @@ export class ReplayView {
     this.camera.up.copy(UP);
     this.controls = new OrbitControls(this.camera, canvas);
     this.controls.addEventListener("change", () => this.render());
+    this.drawn = { methods: [header.order[0]], at: 0, t_s: header.start_s };
+    this.known = new Map(); // distances of the pictures drawn last
     this.scene.add(new THREE.HemisphereLight(0xffffff, 0x8a8f98, 2.2));
     const sun = new THREE.DirectionalLight(0xffffff, 1.6);
     sun.position.set(2, -3, 5);
     this.scene.add(sun);
     const solid = () => new THREE.MeshLambertMaterial();
     const glass = (opacity) => new THREE.MeshLambertMaterial({ transparent: true, opacity, depthWrite: false, polygonOffset: true, polygonOffsetFactor: 2, polygonOffsetUnits: 2 });
-    this.materials = { robot: solid(), shell: glass(0.18), mesh: new THREE.MeshLambertMaterial({ flatShading: true, side: THREE.DoubleSide }), stop: glass(0.35), person: solid(), volume: glass(0.2), base: solid(), object: new THREE.MeshLambertMaterial({ flatShading: true, transparent: true, opacity: 0.55 }) };
+    this.materials = { robot: solid(), shell: glass(0.18), mesh: new THREE.MeshLambertMaterial({ flatShading: true, side: THREE.DoubleSide }), stop: glass(0.35), person: solid(), volume: glass(0.2), base: solid(), object: new THREE.MeshLambertMaterial({ flatShading: true, transparent: true, opacity: 0.55 }), touch: new THREE.MeshLambertMaterial({ transparent: true, opacity: 0.75 }), touchMesh: new THREE.MeshLambertMaterial({ flatShading: true, side: THREE.DoubleSide }) };
     this.renderer.localClippingEnabled = true;
     this.materials.volume.clippingPlanes = [new THREE.Plane(UP, 0)]; // above the floor
     this.robot = new Capsules(header.robot.radius_m, this.materials.robot);
@@ -160,15 +173,18 @@ export class ReplayView {
     this.surfaces = new Surfaces(header.robot, data.motion, this.materials.mesh);
     this.stop = new Capsules(header.robot.radius_m, this.materials.stop);
     this.person = new Capsules(header.body.radius_m, this.materials.person);
+    this.touch = new Capsules([...header.robot.radius_m, ...header.body.radius_m].map((r) => 1.01 * r + 0.001), this.materials.touch);
     const ball = sphere(4);
     this.volumes = data.volumes.limbs.map(() => new Volume(ball, this.materials.volume));
     this.volumeGroup = new THREE.Group();
     this.volumes.forEach((volume) => this.volumeGroup.add(volume.mesh));
     const [bx, by, bz] = header.robot.base_m;
     const [first] = header.robot.ends_m[0]; // the pedestal goes up to the first link where that stands above the base
-    const top = Math.max(Math.hypot(first[0] - bx, first[1] - by) < 0.05 ? first[2] : bz, 0.02);
+    const own = header.robot.meshes.some(({ axes }) => axes === 0); // the base has a mesh of its own
+    const top = own ? bz : Math.max(Math.hypot(first[0] - bx, first[1] - by) < 0.05 ? first[2] : bz, 0.02);
     this.base = new THREE.Mesh(new THREE.CylinderGeometry(0.13, 0.19, top, 32).rotateX(Math.PI / 2), this.materials.base);
     this.base.position.set(bx, by, top / 2);
+    this.base.visible = top > 0.005;
     this.objects = new THREE.Group();
     for (const { corners, triangles, name } of header.objects ?? []) {
       const geometry = new THREE.BufferGeometry();
@@ -191,13 +207,15 @@ export class ReplayView {
       toBody: way(1, 0.006, true),
       toVolume: way(1, 0.006, true),
       watched: way(64, 0.012, false),
+      cameras: way(8 * header.cameras.length + 1, 0.004, false),
     };
+    this.lines.cameras.show(header.cameras.flatMap(({ corners }) => edges(corners)), { pairs: true });
     const corners = header.watched.map(([x, y]) => new THREE.Vector3(x, y, 0.01));
     this.lines.watched.show(corners.length ? [...corners, corners[0]] : [new THREE.Vector3()]);
     this.scene.add(
-      this.robot.group, this.shell.group, this.surfaces.group, this.stop.group, this.person.group, this.volumeGroup, this.base, this.objects, ...Object.values(this.lines).map((one) => one.mesh),
+      this.robot.group, this.shell.group, this.surfaces.group, this.stop.group, this.person.group, this.touch.group, this.volumeGroup, this.base, this.objects, ...Object.values(this.lines).map((one) => one.mesh),
     );
-    this.shown = { meshes: true, person: true, volumes: true, skeleton: true, stop: true, paths: true, distance: true };
+    this.shown = { meshes: true, person: true, volumes: true, skeleton: true, stop: true, paths: true, distance: true, cameras: true };
     this.paint(colours);
     this.home();
   }
@@ -206,8 +224,8 @@ export class ReplayView {
   paint(colours) {
     const { materials, lines } = this;
     this.scene.background = new THREE.Color(colours.stage);
-    for (const [name, material] of Object.entries(materials)) material.color.set(colours[{ mesh: "robot", shell: "robot", object: "base" }[name] ?? name]);
-    for (const [name, one] of Object.entries(lines)) one.mesh.material.color.set(colours[name === "watched" ? "volume" : name]);
+    for (const [name, material] of Object.entries(materials)) material.color.set(colours[{ mesh: "robot", shell: "robot", object: "base", touchMesh: "touch" }[name] ?? name]);
+    for (const [name, one] of Object.entries(lines)) one.mesh.material.color.set(colours[{ watched: "volume", cameras: "soft" }[name] ?? name]);
     if (this.grid) {
       this.scene.remove(this.grid);
       this.grid.dispose();
@@ -218,38 +236,71 @@ export class ReplayView {
     this.scene.add(this.grid);
   }
 
-  // Looks at robot and person from the side of both.
+  // The level direction from which the people hide least of the robot at an instant, with both side by side.
+  clearest(method, at) {
+    const { header, motion } = this.data, { ends, tcp } = posed(header.robot, between(motion(`${method}/q`), at));
+    const body = this.bodyEnds(at), base = new THREE.Vector3(...header.robot.base_m);
+    const points = [...ends.flatMap(([a, b]) => [a, a.clone().lerp(b, 0.5), b]), tcp];
+    const known = body.filter(([a, b]) => Number.isFinite(a.x + b.x));
+    const person = known.reduce((sum, [a, b]) => sum.add(a).add(b), new THREE.Vector3()).divideScalar(Math.max(1, 2 * known.length));
+    const towards = known.length ? person.sub(base).setZ(0).normalize() : new THREE.Vector3(1, 0, 0);
+    const found = Array.from({ length: 36 }, (_, k) => {
+      const side = new THREE.Vector3(Math.cos((k * Math.PI) / 18), Math.sin((k * Math.PI) / 18), 0);
+      const sight = side.clone().addScaledVector(UP, 0.42).normalize().multiplyScalar(4);
+      return { side, hidden: points.filter((p) => this.isHidden(p, sight, body)).length, ahead: Math.abs(side.dot(towards)) };
+    });
+    return found.reduce((best, one) => (one.hidden + 4 * one.ahead < best.hidden + 4 * best.ahead - 1e-9 ? one : best));
+  }
+
+  isHidden(point, sight, body) {
+    const eye = point.clone().add(sight);
+    return body.some(([a, b], part) => {
+      if (!Number.isFinite(a.x + b.x)) return false;
+      const [p, q] = nearestOfSegments(point, eye, a, b);
+      return p.distanceTo(q) < this.data.header.body.radius_m[part];
+    });
+  }
+
+  // Looks at the robots and people of the instant and two seconds around it, from where the robot is seen best.
   home() {
-    const { header, motion } = this.data;
-    const box = new THREE.Box3();
-    const path = motion(`${header.order[0]}/ref_m`), body = motion("points");
-    for (const array of [path, body]) {
-      for (let k = 0; k < array.values.length; k += 3 * 29) {
-        const point = new THREE.Vector3(...array.values.subarray(k, k + 3));
-        if (Number.isFinite(point.x + point.y + point.z)) box.expandByPoint(point);
+    const { header } = this.data, { methods, at } = this.drawn;
+    const { side } = this.clearest(methods[0], at);
+    const back = side.clone().multiplyScalar(0.92).addScaledVector(UP, 0.38).normalize();
+    const right = UP.clone().cross(back).normalize(), up = back.clone().cross(right);
+    const box = new THREE.Box3(); // along right, up and back
+    const see = (point, radius) => {
+      if (!Number.isFinite(point.x + point.y + point.z)) return;
+      const here = new THREE.Vector3(point.dot(right), point.dot(up), point.dot(back));
+      box.expandByPoint(here.clone().addScalar(radius)).expandByPoint(here.addScalar(-radius));
+    };
+    see(new THREE.Vector3(...header.robot.base_m).setZ(0), 0.2);
+    for (const then of [at, at - 2 * header.rate_hz, at + 2 * header.rate_hz]) {
+      for (const method of methods) {
+        const { ends } = posed(header.robot, between(this.data.motion(`${method}/q`), then));
+        ends.forEach((pair, link) => pair.forEach((end) => see(end, header.robot.radius_m[link])));
       }
+      this.bodyEnds(then).forEach((pair, part) => pair.forEach((end) => see(end, header.body.radius_m[part])));
     }
-    const base = new THREE.Vector3(...header.robot.base_m);
-    box.expandByPoint(base);
-    const centre = box.getCenter(new THREE.Vector3());
-    const person = new THREE.Vector3(), size = box.getSize(new THREE.Vector3());
-    between(body, Math.floor(header.count / 2)).slice(0, 3).forEach((x, i) => person.setComponent(i, x));
-    const towards = Number.isFinite(person.x) ? person.sub(base).setZ(0).normalize() : new THREE.Vector3(1, 0, 0);
-    const side = new THREE.Vector3(towards.y, -towards.x, 0).addScaledVector(towards, 0.35).normalize();
-    this.controls.target.copy(centre).setZ(Math.max(0.8, centre.z - 0.15));
-    const tall = 1.25, wide = 0.5 * Math.hypot(size.x, size.y) + 0.25; // what must be seen to all sides [m]
-    const slope = Math.tan((this.camera.fov * Math.PI) / 360);
-    const far = Math.max(tall / slope, wide / (slope * this.camera.aspect));
-    this.camera.position.copy(this.controls.target).addScaledVector(side, 0.92 * far).addScaledVector(UP, 0.38 * far);
+    const centre = box.getCenter(new THREE.Vector3()), half = box.getSize(new THREE.Vector3()).multiplyScalar(0.5);
+    const slope = Math.tan((this.camera.fov * Math.PI) / 360) * 0.94; // a margin around what is to be seen
+    const far = Math.max(half.y / slope, half.x / (slope * this.camera.aspect)) + half.z;
+    this.controls.target.set(0, 0, 0).addScaledVector(right, centre.x).addScaledVector(up, centre.y).addScaledVector(back, centre.z);
+    this.camera.position.copy(this.controls.target).addScaledVector(back, far);
     this.controls.update();
   }
 
   resize(width, height) {
     this.renderer.setPixelRatio(Math.min(2, devicePixelRatio));
     this.renderer.setSize(width, height, false);
-    this.camera.aspect = width / height;
-    this.camera.updateProjectionMatrix();
+    this.fit();
     this.render();
+  }
+
+  // The camera has the shape of one picture of as many as stand side by side.
+  fit() {
+    const { x, y } = this.renderer.getSize(new THREE.Vector2());
+    this.camera.aspect = x / this.drawn.methods.length / y;
+    this.camera.updateProjectionMatrix();
   }
 
   // One instant; ``at`` counts rows of the data, with a share. Returns what stands beside the scene.
@@ -270,13 +321,27 @@ export class ReplayView {
     this.showBones(at);
     const hulls = this.showVolumes(t_s);
     this.showPaths(method, at);
-    return this.showDistances(method, robot.ends, body, hulls, at);
+    const found = this.distances(method, robot.ends, body, hulls, at);
+    this.showDistances(found);
+    this.showTouches(found.touching, robot.ends, body);
+    return found;
+  }
+
+  // Links and parts of the body that touch, in red.
+  showTouches(touching, ends, body) {
+    const nowhere = [new THREE.Vector3(NaN), new THREE.Vector3(NaN)];
+    const links = new Set(touching.map(({ link }) => link)), parts = new Set(touching.map(({ part }) => part));
+    const on = (marked) => (pair, k) => (marked.has(k) ? pair : nowhere);
+    this.touch.show([...ends.map(on(links)), ...body.map(on(this.shown.person ? parts : new Set()))]);
+    this.touch.group.visible = touching.length > 0;
+    this.surfaces.mark(links, this.materials.touchMesh, this.materials.mesh);
   }
 
   // Links with a mesh as that, in a shell: the capsule that their distances are measured from.
   showRobot({ T, ends }) {
     const { meshes } = this.data.header.robot, nowhere = [new THREE.Vector3(NaN), new THREE.Vector3(NaN)];
-    const bare = ends.map((_, link) => !this.shown.meshes || !meshes.includes(link));
+    const covered = new Set(meshes.map(({ link }) => link));
+    const bare = ends.map((_, link) => !this.shown.meshes || !covered.has(link));
     this.robot.show(ends.map((pair, link) => (bare[link] ? pair : nowhere)));
     this.shell.show(ends.map((pair, link) => (bare[link] ? nowhere : pair)));
     this.surfaces.group.visible = this.shown.meshes;
@@ -300,8 +365,7 @@ export class ReplayView {
   showBones(at) {
     const row = between(this.data.motion("points"), at);
     const points = this.data.header.bones.flat().map((k) => new THREE.Vector3(row[3 * k], row[3 * k + 1], row[3 * k + 2]));
-    const known = points.every((point) => Number.isFinite(point.x));
-    this.lines.bones.show(this.shown.skeleton && known ? points : [], { pairs: true });
+    this.lines.bones.show(this.shown.skeleton ? points : [], { pairs: true }); // of people who are not known: none
   }
 
   showVolumes(t_s) {
@@ -335,9 +399,11 @@ export class ReplayView {
     this.lines.driven.show(this.shown.paths ? piece("tcp_m", at - 8 * rate, at) : [], seen);
   }
 
-  // Lines from the robot's surface to the nearest body part and to the nearest volume.
-  showDistances(method, ends, body, stored, at) {
-    const { header } = this.data, found = { body: null, volume: null };
+  // The nearest body part and the nearest volume to the robot's surface, and all pairs that touch.
+  distances(method, ends, body, stored, at) {
+    const key = `${method} ${at} ${this.shown.volumes}`;
+    if (this.known.has(key)) return this.known.get(key);
+    const { header } = this.data, found = { body: null, volume: null, touching: [] };
     const consider = (kind, link, name, p, q, radius) => {
       const pair = surfaces(p, q, header.robot.radius_m[link], radius);
       if (found[kind] === null || pair.distance < found[kind].distance) {
@@ -349,6 +415,9 @@ export class ReplayView {
         if (!Number.isFinite(c.x + d.x + a.x)) return;
         const [p, q] = nearestOfSegments(a, b, c, d);
         consider("body", link, header.body.parts[part], p, q, header.body.radius_m[part]);
+        if (surfaces(p, q, header.robot.radius_m[link], header.body.radius_m[part]).distance <= 0) {
+          found.touching.push({ link, part, at: p.clone().lerp(q, 0.5) });
+        }
       });
       if (method !== header.order[0] || !Number.isFinite(a.x)) return; // the volumes are those of the run's own method
       for (const hull of stored?.hulls ?? []) {
@@ -356,13 +425,43 @@ export class ReplayView {
         consider("volume", link, this.data.volumes.limb_names[hull.limb], p, q, hull.radius);
       }
     });
-    const { toBody, toVolume } = this.lines, on = this.shown.distance;
-    toBody.show(on && found.body ? [found.body.from, found.body.to] : []);
-    toVolume.show(on && found.volume && found.volume.distance > 0 ? [found.volume.from, found.volume.to] : []);
+    if (this.known.size > 3) this.known.clear();
+    this.known.set(key, found);
     return found;
   }
 
+  // Lines to the nearest body part and to the nearest volume.
+  showDistances(found) {
+    const { toBody, toVolume } = this.lines, on = this.shown.distance;
+    toBody.show(on && found.body && found.body.distance > 0 ? [found.body.from, found.body.to] : []);
+    toVolume.show(on && found.volume && found.volume.distance > 0 ? [found.volume.from, found.volume.to] : []);
+  }
+
+  // One instant of one method, or of several side by side from the same place. Returns what ``show`` does, for each.
+  draw(methods, at, t_s) {
+    const fits = methods.length === this.drawn.methods.length;
+    this.drawn = { methods, at, t_s };
+    if (!fits) this.fit();
+    return this.render();
+  }
+
   render() {
-    this.renderer.render(this.scene, this.camera);
+    const { methods, at, t_s } = this.drawn, { x, y } = this.renderer.getSize(new THREE.Vector2()), found = [];
+    const wide = x / methods.length;
+    this.renderer.setScissorTest(methods.length > 1);
+    for (let k = methods.length - 1; k >= 0; k--) { // the first one last: it is the one that stays
+      found[k] = this.show(methods[k], at, t_s);
+      this.renderer.setViewport(k * wide, 0, wide, y);
+      this.renderer.setScissor(k * wide, 0, wide, y);
+      this.renderer.render(this.scene, this.camera);
+    }
+    this.told?.(found);
+    return found;
+  }
+
+  // Where a point of the world is in a picture, as shares of its width and height from the upper left.
+  onScreen(point) {
+    const { x, y, z } = point.clone().project(this.camera);
+    return { x: 0.5 + 0.5 * x, y: 0.5 - 0.5 * y, ahead: z < 1 };
   }
 }

@@ -1,0 +1,106 @@
+"""Figures, page and scenes of a run with two people show both; of a run with one they are as without the other."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hrcreplay.human.model import PARTS
+from hrcreplay.reporting.figures import catalogue
+from hrcreplay.reporting.figures.catalogue import FigureData
+from hrcreplay.reporting.metrics.people import named_volumes
+from hrcreplay.reporting.page import report_page
+from hrcreplay.reporting.page.replay_page import replay_data, snapshot, solids
+from hrcreplay.reporting.replay_scene import SHOWN_POINTS
+from hrcreplay.reporting.scene_mcap import write_scene
+from tests.reporting.moving import SECOND_M, moving_run, moving_scene, two_people
+from tests.reporting.reading import read
+from tests.reporting.synthetic import metrics_of
+from tests.reporting.test_scene_mcap import _topics
+
+ONE, BOTH = moving_scene(moving_run(4.0)), moving_scene(two_people(moving_run(4.0)))
+PARTS_SHOWN = len(ONE.body_parts)
+
+
+def test_the_second_person_is_shown_where_it_is() -> None:
+    assert BOTH.people == (1, 2)
+    count = len(SHOWN_POINTS)
+    np.testing.assert_array_equal(BOTH.points_m[:, :count], ONE.points_m)
+    np.testing.assert_allclose(BOTH.points_m[:, count:], ONE.points_m + SECOND_M, atol=1e-12)
+    np.testing.assert_array_equal(BOTH.body_m[:, :PARTS_SHOWN], ONE.body_m)
+    np.testing.assert_allclose(BOTH.body_m[:, PARTS_SHOWN:], ONE.body_m + SECOND_M, atol=1e-12)
+    assert BOTH.body_parts[PARTS_SHOWN:] == tuple(f"{part} of person 2" for part in PARTS[:PARTS_SHOWN])
+    np.testing.assert_array_equal(BOTH.body_radius_m, np.tile(ONE.body_radius_m, 2))
+    assert {name for name in BOTH.volumes.limbs if name.endswith("2")} == {
+        f"{n} of person 2" for n in ONE.volumes.limbs
+    }
+
+
+def test_the_bones_of_each_person_join_its_own_points() -> None:
+    first, second = np.split(BOTH.bones, 2)
+    np.testing.assert_array_equal(first, ONE.bones)
+    np.testing.assert_array_equal(second - first, len(SHOWN_POINTS))
+
+
+def test_the_pages_header_names_the_parts_of_both() -> None:
+    header = json.loads(replay_data(BOTH)[0])
+    assert len(header["body"]["parts"]) == 2 * PARTS_SHOWN == len(header["body"]["radius_m"])
+    assert "right lower arm of person 2" in header["body"]["parts"]
+    assert len(header["bones"]) == len(BOTH.bones)
+    assert header["entries"]["body"]["columns"] == 2 * json.loads(replay_data(ONE)[0])["entries"]["body"]["columns"]
+
+
+def test_a_still_holds_the_bodies_of_both() -> None:
+    row = 80
+    assert len(solids(BOTH, row)) == len(solids(ONE, row)) + PARTS_SHOWN
+    assert snapshot(BOTH, row).axes
+
+
+def test_scene_mcap_has_an_entity_for_each(tmp_path: Path) -> None:
+    write_scene(tmp_path / "scene.mcap", BOTH, None)
+    found, row = _topics(tmp_path / "scene.mcap"), 80
+    assert [one.id for one in found["/person/fused"][row][1].entities] == ["fused", "fused 2"]
+    first, second = found["/person/recorded"][row][1].entities
+    assert (first.id, second.id) == ("recorded", "recorded 2")
+    for mine, theirs in zip(first.spheres, second.spheres, strict=True):
+        at, other = (np.array([p.x, p.y, p.z]) for p in (mine.pose.position, theirs.pose.position))
+        np.testing.assert_allclose(other - at, SECOND_M, atol=2e-3)
+        assert mine.size.x == theirs.size.x
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder, run = tmp_path_factory.mktemp("figures"), two_people(moving_run(4.0))
+    metrics = metrics_of(run)
+    for number in run.people:
+        data = FigureData(run.of_person(number), metrics, near_m=0.5, stationary_m_per_s=0.001, everybody=run)
+        kinds = catalogue.select_figures(data.run, metrics)
+        catalogue.draw_all(data, folder, [kind for kind in kinds if number == 1 or kind.each], number)
+    return folder
+
+
+def test_figures_of_one_person_are_drawn_for_each_and_named(drawn: Path) -> None:
+    run = two_people(moving_run(4.0))
+    html = report_page.render(run.of_person(1), metrics_of(run), drawn, people=run.people)
+    text = " ".join(read(html).text)
+    assert {"joint_angles.svg", "joint_angles_person_2.svg"} <= {path.name for path in drawn.iterdir()}
+    assert "Person 1. All joints of the human model" in text
+    assert "Person 2. All joints of the human model" in text
+    assert (drawn / "joint_angles.svg").read_bytes() != (drawn / "joint_angles_person_2.svg").read_bytes()
+    alone = report_page.render(run.of_person(1), metrics_of(run), drawn)
+    assert "Person 1." not in " ".join(read(alone).text)
+
+
+def test_figures_of_the_volumes_hold_those_of_both(drawn: Path, tmp_path: Path) -> None:
+    one = moving_run(4.0)
+    kinds = catalogue.find("9")
+    data = FigureData(one, metrics_of(one), near_m=0.5, stationary_m_per_s=0.001)
+    catalogue.draw_all(data, tmp_path, kinds)
+    assert (tmp_path / "fig09_volumes.svg").read_bytes() != (drawn / "fig09_volumes.svg").read_bytes()
+    limbs = named_volumes(two_people(one).occupancy)
+    assert limbs is not None
+    assert "LRA of person 2" in set(limbs["limb"])
+    assert named_volumes(one.occupancy) is one.occupancy
