@@ -38,7 +38,7 @@ from hrcreplay.store.run_folder import Run, RunWriter
 
 
 def write_report(run_config: RunConfig, writer: RunWriter, meta: dict[str, Any], log: Log | None = None) -> None:
-    """Writes metrics.json, the figures, report.html, scene.mcap and its layout beside the tables that have just been written.
+    """Writes metrics.json, the figures, report.html, scene.mcap and its layout beside the tables just written.
 
     Args:
         run_config: The run.

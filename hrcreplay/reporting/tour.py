@@ -97,7 +97,7 @@ def _worst_of(scene: ReplayScene, name: str) -> list[tuple[int, str]]:
         start = int(np.searchsorted(scene.seconds, event.at_s))
         rows = slice(start, max(start + 1, int(np.searchsorted(scene.seconds, event.at_s + event.moving_s))))
         row = min(start + _lowest(track.body_m[rows]), len(scene.seconds) - 1)
-        found.append((row, f"contact of {event.link or 'the robot'} and {_part(event.limb)}"))
+        found.append((row, f"contact of {event.link.replace('_', ' ') or 'the robot'} and {_part(event.limb)}"))
     if np.isfinite(track.body_m).any():
         row = _lowest(track.body_m)
         if track.body_m[row] > 0.0:

@@ -11,6 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hrcreplay.errors import SettingsError
+from hrcreplay.records import Floats
 from hrcreplay.reporting import scene_rerun
 from hrcreplay.reporting.replay_scene import CameraSight, ReplayScene
 from hrcreplay.reporting.scene_messages import surface_mesh
@@ -26,7 +27,7 @@ def scene() -> ReplayScene:
     sight = CameraSight("kinect", np.eye(4), (0.55, 0.42), True)
     table = np.array([[x, y, z] for x in (0.4, 1.0) for y in (-0.5, 0.5) for z in (0.70, 0.74)])
     found = moving_scene(two_people(moving_run(4.0)))
-    horizons_s = 0.1 + 0.001 * np.arange(len(found.volumes.t_ns))
+    horizons_s: Floats = 0.1 + 0.001 * np.arange(len(found.volumes.t_ns), dtype=np.float64)
     volumes = dataclasses.replace(found.volumes, horizon_s=horizons_s)
     return dataclasses.replace(found, volumes=volumes, cameras=(sight,), objects=(StaticHull("table", table, 0.0),))
 
@@ -148,7 +149,8 @@ def test_series_and_camera_are_those_of_the_scene(entities: dict[str, list[Any]]
 
 def test_a_blueprint_shows_scene_plots_and_status(file: Path) -> None:
     (entry,) = chunk.RrdReader(file).blueprints()
-    origins, classes = set(), set()
+    origins: set[str] = set()
+    classes: set[str] = set()
     for one in chunk.RrdReader(file).stream(store=entry):
         table = one.to_record_batch()
         for name, found in (("ViewBlueprint:space_origin", origins), ("ViewBlueprint:class_identifier", classes)):

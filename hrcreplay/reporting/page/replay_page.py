@@ -224,7 +224,7 @@ def _header(scene: ReplayScene) -> dict[str, Any]:
             "radius_m": scene.body_radius_m.tolist(),
         },
         "robot": {
-            "links": list(robot.links),
+            "links": [link.replace("_", " ") for link in robot.links],
             "radius_m": robot.radius_m.tolist(),
             "ends_m": robot.ends_m.tolist(),
             "moved_by": robot.moved_by.tolist(),
@@ -276,6 +276,7 @@ def _event(event: Mapping[str, Any]) -> dict[str, Any]:
     for name, value in event.items():
         found[name] = (round(value, 3) if math.isfinite(value) else None) if isinstance(value, float) else value
     found["limb"] = part_name_text(event["limb"]) if event["limb"] else ""
+    found["link"] = event["link"].replace("_", " ")
     return found
 
 

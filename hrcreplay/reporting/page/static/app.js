@@ -38,7 +38,7 @@ export async function start(root) {
   // As the tables of the page: millimetres, milliseconds below a second, else tenths.
   const metresPerSecond = (x, programmed) =>
     Number.isFinite(x) ? `${x.toFixed(3)}${Number.isFinite(programmed) ? ` of ${programmed.toFixed(3)}` : ""} m/s` : "not known";
-  const metres = (x) => (Number.isFinite(x) ? `${x.toFixed(3)} m` : "not known");
+  const metres = (x) => (Number.isFinite(x) ? `${x.toFixed(3)} m`.replace("-", "\u2212") : "not known");
   const duration = (x) => (x < 1 ? `${Math.round(1000 * x)} ms` : `${x.toFixed(1)} s`);
   const shown = () => (state.beside === null ? [state.method] : [state.method, state.beside]);
   const title = (method) => (method === header.order[0] ? `${method} (this plan)` : method);
@@ -75,7 +75,8 @@ export async function start(root) {
       if (!touching) return;
       touch.textContent = `contact: ${near[k].body.link} – ${near[k].body.limb}`;
       const { x, y } = view.onScreen(near[k].body.from);
-      Object.assign(touch.style, { left: `${100 * Math.max(0.02, Math.min(0.6, x))}%`, top: `${100 * Math.max(0.1, Math.min(0.85, y + 0.06))}%` });
+      const share = Math.max(0.01, Math.min(0.99, x)); // of the picture, and of the words: they stay inside
+      Object.assign(touch.style, { left: `${100 * share}%`, transform: `translateX(${-100 * share}%)`, top: `${100 * Math.max(0.1, Math.min(0.85, y + 0.07))}%` });
     });
   }
 

@@ -165,7 +165,7 @@ export class ReplayView {
     this.scene.add(sun);
     const solid = () => new THREE.MeshLambertMaterial();
     const glass = (opacity) => new THREE.MeshLambertMaterial({ transparent: true, opacity, depthWrite: false, polygonOffset: true, polygonOffsetFactor: 2, polygonOffsetUnits: 2 });
-    this.materials = { robot: solid(), shell: glass(0.18), mesh: new THREE.MeshLambertMaterial({ flatShading: true, side: THREE.DoubleSide }), stop: glass(0.35), person: solid(), volume: glass(0.2), base: solid(), object: new THREE.MeshLambertMaterial({ flatShading: true, transparent: true, opacity: 0.55 }), touch: new THREE.MeshLambertMaterial({ transparent: true, opacity: 0.75 }), touchMesh: new THREE.MeshLambertMaterial({ flatShading: true, side: THREE.DoubleSide }) };
+    this.materials = { robot: solid(), shell: glass(0.18), mesh: new THREE.MeshLambertMaterial({ flatShading: true, side: THREE.DoubleSide }), stop: glass(0.22), person: solid(), volume: glass(0.2), base: solid(), object: new THREE.MeshLambertMaterial({ flatShading: true, transparent: true, opacity: 0.55 }), touch: new THREE.MeshLambertMaterial({ transparent: true, opacity: 0.75 }), touchMesh: new THREE.MeshLambertMaterial({ flatShading: true, side: THREE.DoubleSide }) };
     this.renderer.localClippingEnabled = true;
     this.materials.volume.clippingPlanes = [new THREE.Plane(UP, 0)]; // above the floor
     this.robot = new Capsules(header.robot.radius_m, this.materials.robot);
