@@ -9,6 +9,9 @@ from __future__ import annotations
 #: differ, by at most 1e-9, and the run was recorded on another machine.
 EXIT_DIFFERS, EXIT_SAME_DECISIONS = 1, 6
 
+#: Exit code of a command that Ctrl-C ended: 128 + SIGINT, as shells count.
+EXIT_INTERRUPTED = 130
+
 _SHOWN = 200
 
 

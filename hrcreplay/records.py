@@ -81,6 +81,8 @@ OF_PERSON = " of person "
 RECORDED = "recorded"
 #: Methods whose motion rests on no volume: the programme without reaction, and the robot as recorded.
 UNGUARDED = ("none", RECORDED)
+#: Methods that may touch people, so slowly that the force of the contact keeps its limit; see ``human.contact_limits``.
+ALLOWING_CONTACT = ("pfl",)
 
 #: POINTS with left and right exchanged.
 MIRROR = tuple(

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from hrcreplay.cli.commands import completion
 from hrcreplay.errors import SettingsError
 
 Source = Annotated[Path, typer.Argument(metavar="LOG_OR_RUN", help="A log, or the run folder of an earlier stage.")]
@@ -26,7 +27,12 @@ Topic = Annotated[
 ]
 LimitSet = Annotated[
     str | None,
-    typer.Option("--limits", metavar="SET", help="Limit set of the prediction: paper, human, people, or a TOML file."),
+    typer.Option(
+        "--limits",
+        metavar="SET",
+        help="Limit set of the prediction: paper, human, people, or a TOML file.",
+        autocompletion=completion(("paper", "human", "people")),
+    ),
 ]
 CellFile = Annotated[
     Path | None,

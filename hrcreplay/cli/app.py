@@ -30,13 +30,21 @@ from hrcreplay.cli import (
     live,
     span,
 )
+from hrcreplay.cli.commands import App, completion, interruptible, print_run, tell
 from hrcreplay.errors import CoverageMissed, HrcReplayError, SettingRenamed, SettingsError
 from hrcreplay.version import __version__
 
-app = typer.Typer(
+#: Kinds of files that ``import`` reads, and sections of the settings: what both are is slow to load.
+KINDS = (
+    *("azure", "kinect2", "keraal", "table", "mediapipe", "openpose", "k4abt", "zed"),
+    *("trc", "c3d", "bvh", "optitrack", "mvnx", "ntu", "chico", "harper"),
+)
+SECTIONS = ("logs", "fusion", "limits", "prediction", "robot", "plan", "report", "live")
+
+app = App(
     name="hrcreplay",
     no_args_is_help=True,
-    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
     help="""Had this controller been running, would the person have been safe, and what would it have cost the task?
@@ -69,11 +77,13 @@ def info(
     settings: Set = None,
     topic: Topic = None,
     cell: CellFile = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print all of it as JSON.")] = False,
 ) -> None:
     """Show the content of a log, and what is missing for the next step."""
     from hrcreplay.commands import inputs
 
-    sys.stdout.write("\n".join(inputs.describe(log, config, as_overrides(settings, topic), cell)) + "\n")
+    found = inputs.describe(log, config, as_overrides(settings, topic), cell, as_json=as_json)
+    sys.stdout.write("\n".join(found) + "\n")
 
 
 @app.command(name="import")
@@ -82,8 +92,8 @@ def import_(
         str,
         typer.Argument(
             metavar="KIND",
-            help="azure, kinect2, keraal, table, mediapipe, openpose, k4abt, zed, trc, c3d, bvh, optitrack, mvnx, ntu, "
-            "chico or harper.",
+            help=f"{', '.join(KINDS[:-1])} or {KINDS[-1]}.",
+            autocompletion=completion(KINDS),
         ),
     ],
     files: Annotated[
@@ -106,7 +116,7 @@ def import_(
     from hrcreplay.commands import inputs
 
     for note in inputs.import_files(kind, files, out, rate, mapping):
-        sys.stderr.write(f"hrcreplay: {note}\n")
+        tell(note)
     sys.stdout.write(f"{out}\n")
 
 
@@ -148,7 +158,7 @@ def calibrate(
     for line in inputs.calibrate(
         log, out, config, as_overrides(settings, topic), reference=camera, up=up, height_m=height, base=base
     ):
-        sys.stderr.write(f"hrcreplay: {line}\n")
+        tell(line)
     sys.stdout.write(f"{out}\n")
 
 
@@ -180,7 +190,7 @@ def _stage(command: str, text: str) -> None:
             smooth=smooth,
             chunk_ticks=chunk_ticks,
         )
-        sys.stdout.write(f"{folder}\n")
+        print_run(folder)
 
 
 def _run(command: str, source: Path, **options: Any) -> Path:
@@ -267,7 +277,7 @@ def report(
         smooth=smooth,
         chunk_ticks=chunk_ticks,
     )
-    sys.stdout.write(f"{folder}\n")
+    print_run(folder)
 
 
 def _part_of_report(
@@ -338,7 +348,7 @@ def compare(
         cell_file=cell,
         **span(start, end),
     )
-    sys.stdout.write(f"{folder}\n")
+    print_run(folder)
 
 
 @app.command()
@@ -347,7 +357,11 @@ def why(
     at: Annotated[float, typer.Option("--at", metavar="S", help="Instant, in seconds after the first tick.")],
     method: Annotated[
         str | None,
-        typer.Option("--method", metavar="NAME", help="One of the run's baselines; default: the run's own method."),
+        typer.Option(
+            "--method",
+            metavar="NAME",
+            help="One of the run's baselines, or recorded: the robot as it ran; default: the run's own method.",
+        ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print all facts as JSON.")] = False,
 ) -> None:
@@ -380,7 +394,7 @@ def audit(
 
     overrides = as_overrides(settings, topic, limits)
     folder = auditing.run(sources, out=out, config=config, overrides=overrides, cell_file=cell, **span(start, end))
-    sys.stdout.write(f"{folder}\n")
+    print_run(folder)
 
 
 @app.command(name="fit-limits")
@@ -413,7 +427,7 @@ def fit_limits(
     options = {"config": config, "overrides": overrides, "cell_file": cell, **span(start, end)}
     found = fit.run(logs, out=out, coverage=coverage, held_back=held_back, cover=cover, **options)
     for line in found.lines:
-        sys.stderr.write(f"hrcreplay: {line}\n")
+        tell(line)
     sys.stdout.write(f"{out}\n")
     if found.missed:
         raise CoverageMissed(f"{out}: {found.missed}")
@@ -432,7 +446,12 @@ def init(
 
 @app.command(name="settings")
 def settings_(
-    section: Annotated[str | None, typer.Argument(metavar="SECTION", help="Only this section, such as fusion.")] = None,
+    section: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="SECTION", help="Only this section, such as fusion.", autocompletion=completion(SECTIONS)
+        ),
+    ] = None,
 ) -> None:
     """Print all settings with their defaults, units and meanings, as a settings file."""
     from hrcreplay.settings.listing import as_toml
@@ -452,7 +471,7 @@ def demo(
 
     cell, how = replay.demo_cell(), {"config": config, "overrides": as_overrides(settings)}
     folder = _run("report", replay.demo_log(), cell_file=cell, out=out, chunk_ticks=chunk_ticks, **how)
-    sys.stdout.write(f"{folder / 'report.html'}\n")
+    print_run(folder, folder / "report.html")
 
 
 live.register(app)
@@ -481,7 +500,8 @@ def main() -> None:
     warnings.showwarning = _show_warning
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     try:
-        app()
+        with interruptible():
+            app()
     except HrcReplayError as error:
-        sys.stderr.write(f"hrcreplay: {error}\n")
+        tell(str(error))
         sys.exit(error.exit_code)

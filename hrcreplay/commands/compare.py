@@ -10,6 +10,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import shutil
+import signal
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -35,9 +36,11 @@ from hrcreplay.evaluation.contact import (
     read_recorded_people,
 )
 from hrcreplay.evaluation.recorded_person import RecordedPeople
+from hrcreplay.evaluation.severity import severity_table
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.pipeline import assembly, reuse, stages
 from hrcreplay.pipeline.assembly import Follower, Forecast, Recorded
+from hrcreplay.pipeline.robot_mass import robot_mass
 from hrcreplay.pipeline.run_config import RunConfig, RunOptions, resolve
 from hrcreplay.pipeline.stages import ProgressBar, Sink, collect_plan_findings, print_note
 from hrcreplay.records import RECORDED, UNGUARDED, Floats, Ints
@@ -51,7 +54,7 @@ from hrcreplay.robot.task import Reference
 from hrcreplay.settings.load import Settings
 from hrcreplay.settings.sections import Plan, Prediction
 from hrcreplay.store.columns import motion_columns, read_states
-from hrcreplay.store.run_folder import RunWriter, Stopwatch
+from hrcreplay.store.run_folder import RunWriter, Stopwatch, arrow_table
 
 #: The default variants: the programme without reaction; four methods with the sound volumes up to the end of each
 #: tick's own stop; qp with sound volumes up to a fixed horizon; and the two methods of the paper with its volumes and
@@ -59,7 +62,7 @@ from hrcreplay.store.run_folder import RunWriter, Stopwatch
 PRESET = "none,ssm,shield,scaling,qp,qp:sound:fixed,qp:paper:fixed,scaling:paper:fixed"
 
 #: Approximate relative cost of a tick by method; long tasks start first.
-_COST = {"qp": 5, "ssm": 4, "none": 3, "shield": 3, "scaling": 3, RECORDED: 2}
+_COST = {"qp": 5, "ssm": 4, "pfl": 4, "none": 3, "shield": 3, "scaling": 3, RECORDED: 2}
 
 
 @dataclass(frozen=True)
@@ -135,6 +138,7 @@ def run(
         for log_name, note in comparison.notes(found):
             print_note(f"{log_name}: {note}" if len(logs) > 1 else note)
         comparison.write(found, writer)
+        writer.text("severity.csv", _contacts(writer.partial, logs))
         comparison.print_tables(found)
         writer.timing.update(watch.summary(1.0 / run_configs[0].settings.fusion.rate_hz))
         writer.finish(_meta(run_configs, list(found["methods"]), began))
@@ -236,13 +240,24 @@ def _compare_log(
     writer.timing[f"plan {name}"] = {variant.label: {"seconds": took[variant]} for variant in variants}
     part.partial.rename(part.folder)
     rows = {
-        variant: comparison.figures(variant, motion, contact, _report_settings(run_config))
+        variant: comparison.figures(variant, *tables(part.folder, variant), _report_settings(run_config))
         for variant in variants
-        for motion, contact in [tables(part.folder, variant)]
     }
-    return comparison.LogResult(
-        name, run_config.log_sha256, people.source, float(ticks_ns[-1] - ticks_ns[0]) * 1e-9, notes, rows
-    )
+    seconds = float(ticks_ns[-1] - ticks_ns[0]) * 1e-9
+    mass = robot_mass(run_config.settings.robot, assembly.robot(run_config, programme.T_world_base)).source
+    return comparison.LogResult(name, run_config.log_sha256, people.source, seconds, notes, mass, rows)
+
+
+def _contacts(folder: Path, logs: Sequence[comparison.LogResult]) -> str:
+    """Returns all rows of severity of all logs and variants as CSV, an empty cell for what is not known."""
+    rows = []
+    for log in logs:
+        for variant in log.figures:
+            severity = pq.read_table(folder / log.name / f"severity_{variant.slug}.parquet").to_pandas()
+            severity.insert(0, "log", log.name)
+            severity.insert(1, "variant", variant.label)
+            rows.append(severity)
+    return pd.concat(rows).to_csv(index=False, lineterminator="\n")
 
 
 def _full_coverages(
@@ -301,9 +316,13 @@ def _silent(_stage: str, _ticks: int) -> None:
     """Ignores fusion progress."""
 
 
-def tables(folder: Path, variant: Variant) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Returns motion and contact of a variant."""
-    return tuple(pq.read_table(folder / f"{what}_{variant.slug}.parquet").to_pandas() for what in ("motion", "contact"))
+def tables(folder: Path, variant: Variant) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]:
+    """Returns motion, contact and severity of a variant."""
+    motion, contact, severity = (
+        pq.read_table(folder / f"{what}_{variant.slug}.parquet").to_pandas()
+        for what in ("motion", "contact", "severity")
+    )
+    return motion, contact, severity
 
 
 def _report_settings(run_config: RunConfig) -> comparison.Bounds:
@@ -384,10 +403,14 @@ def _plan_all(tasks: Sequence[VariantTask], processes: int, advance: Callable[[i
 
 
 def _second_process() -> ProcessPoolExecutor:
-    """Starts a process with its own copy of the compiled kernels, as numba does not lock its files."""
+    """Starts a process with its own copy of the compiled kernels, as numba does not lock its files.
+
+    It ignores Ctrl-C: the first process ends it.
+    """
     second = kernels.folder() / "second"
     kernels.share(kernels.folder(), second)
-    pool = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
+    spawn = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(1, spawn, initializer=signal.signal, initargs=(signal.SIGINT, signal.SIG_IGN))
     mine = os.environ.get("NUMBA_CACHE_DIR")
     os.environ["NUMBA_CACHE_DIR"] = str(second)  # read by the process at its start
     try:
@@ -429,8 +452,11 @@ def plan(task: VariantTask, progress: Callable[[int], None] | None = None) -> tu
     full = None if task.variant.method in UNGUARDED else task.full
     recorded = task.programme.recorded if task.variant.method == RECORDED else None
     capsules = recorded if isinstance(recorded, RecordedCapsules) else None
-    rows = contact_table(run_config, robot, task.variant.method, motion, task.people, predicted, own, full, capsules)
+    method, people = task.variant.method, task.people
+    rows = contact_table(run_config, robot, method, motion, people, predicted, own, full, capsules)
     writer.table(f"contact_{slug}", rows)
+    meetings = arrow_table(rows).to_pandas()
+    writer.table(f"severity_{slug}", severity_table(run_config, robot, method, motion, meetings, people, capsules))
     writer.close_tables()
     return done, time.perf_counter() - began_s
 

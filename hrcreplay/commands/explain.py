@@ -1,7 +1,8 @@
 """The command ``why``: finds the cause that limited the robot at one tick of a run, from the run's tables.
 
 The tick is computed again from the recorded ticks before it, with the same code. A cause is given only if the result
-equals the recorded step bit by bit.
+equals the recorded step bit by bit. Of the robot as recorded no cause is known: where it was is told, how near to the
+person's volumes and to the recorded body, and what each controller of the run did at that instant.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.pipeline import assembly
 from hrcreplay.pipeline.assembly import Forecast
 from hrcreplay.pipeline.run_config import RunConfig, resolve
-from hrcreplay.records import LIMBS, STATUSES, Floats, HumanStates, Ints
+from hrcreplay.records import ALLOWING_CONTACT, LIMBS, RECORDED, STATUSES, Floats, HumanStates, Ints
 from hrcreplay.reporting.metrics.planning import stationary
 from hrcreplay.reporting.metrics.series import true_runs
 from hrcreplay.reporting.tables import PageTable, neighbour_text, reason_text
@@ -37,7 +38,8 @@ from hrcreplay.robot.control.control_step import (
     stop_straight,
 )
 from hrcreplay.robot.control.controllers import Controller, Predict, QpController
-from hrcreplay.store.columns import read_states
+from hrcreplay.store.columns import motion_columns, read_states
+from hrcreplay.store.run_folder import arrow_table
 
 #: A TCP slower than this counts as stationary [m/s].
 _STANDS = 1e-3
@@ -70,17 +72,31 @@ class Record:
         self.run_config = replace(self.run_config, settings=self.run_config.settings.model_copy(update={"plan": plan}))
 
     @cached_property
+    def programme(self) -> assembly.RunProgramme:
+        """The robot and its programme."""
+        robot = assembly.robot(self.run_config, assembly.robot_base(self.run_config, self.log))
+        return assembly.programme(self.run_config, self.log, robot)
+
+    @cached_property
     def surroundings(self) -> assembly.Surroundings:
         """Returns the obstacles of the robot."""
-        return assembly.surroundings(self.run_config, self.controller.robot)
+        return assembly.surroundings(self.run_config, self.programme.path.model)
 
     @cached_property
     def controller(self) -> Controller:
         """Makes the method's controller, at the start of its programme."""
-        robot = assembly.robot(self.run_config, assembly.robot_base(self.run_config, self.log))
-        programme = assembly.programme(self.run_config, self.log, robot)
-        (planner,) = assembly.planners(self.run_config, programme, int(self.states.t_ns[0])).values()
+        (planner,) = assembly.planners(self.run_config, self.programme, int(self.states.t_ns[0])).values()
         return planner.controller
+
+    def read_as_recorded(self, tick: int) -> bool:
+        """Returns True if the row of the robot as recorded comes out again from the log and the volumes of the tick."""
+        if self.programme.recorded is None:
+            return False
+        motion = assembly.recorded_motion(self.run_config, self.programme.path.model, self.programme.recorded, None)
+        t_ns = self.motion["t_ns"].to_numpy()[tick : tick + 1]
+        again = arrow_table(motion_columns(motion.follow(t_ns, [self.predict(tick)], self.names))).to_pylist()[0]
+        row = self.motion.iloc[tick]
+        return all(row[name] == value or (pd.isna(row[name]) and pd.isna(value)) for name, value in again.items())
 
     def predict(self, tick: int) -> Predict:
         """Predicts the obstacles at a tick."""
@@ -188,7 +204,7 @@ def explain(folder: Path, at_s: float, method: str | None = None) -> dict[str, A
     Args:
         folder: Run folder with a plan.
         at_s: Time after the first tick [s].
-        method: None: the run's own; else one of its baselines.
+        method: None: the run's own; else one of its baselines, or recorded.
 
     Raises:
         SettingsError: The run has no such instant or method, or the tick cannot be reproduced as recorded.
@@ -198,7 +214,8 @@ def explain(folder: Path, at_s: float, method: str | None = None) -> dict[str, A
     ends_s = float(t_ns[-1] - t_ns[0]) * 1e-9
     if not 0.0 <= at_s <= ends_s:
         raise SettingsError(f"--at {at_s:g}: would be right: seconds from the first tick, 0 to {ends_s:.3f}")
-    found = facts(record, int(np.argmin(np.abs(t_ns - t_ns[0] - round(at_s * 1e9)))))
+    tick = int(np.argmin(np.abs(t_ns - t_ns[0] - round(at_s * 1e9))))
+    found = facts_as_recorded(record, tick) if record.method == RECORDED else facts(record, tick)
     if found is None:
         raise SettingsError(
             f"{folder}: the tick at {at_s:g} s could not be reproduced as recorded, so there is no explanation; run "
@@ -244,9 +261,12 @@ def facts(record: Record, tick: int) -> dict[str, Any] | None:
             name: float(since.max()) if since is not None and np.isfinite(since).all() else None
             for name, since in (("nobody_s", people.nobody_s), ("nobody_else_s", people.nobody_else_s))
         }
-    if record.method == "none" or standstill_reason(sight, settings):
+    if record.method == "none" or (record.method not in ALLOWING_CONTACT and standstill_reason(sight, settings)):
         return found
     proposals, more = propose_explained(record.controller, context)
+    for row in more.get("binding", ()):
+        if "volume" in row:  # among all volumes, not only those that are kept clear of
+            row["beside"] = record.names[row.pop("volume")]
     found |= _named(more, links, limbs) | _objects(record, tick)
     if isinstance(proposals, list) and settings.certified and record.motion["reason"].iloc[tick] == "not certified":
         until, static = (context.seen.obstacles, context.seen.horizon_s), record.controller.static
@@ -254,6 +274,59 @@ def facts(record: Record, tick: int) -> dict[str, Any] | None:
             _named(explain_refusal(robot, context.current_stop, proposal, *until, settings, static), links, limbs)
             for proposal in proposals
         ]
+    return found
+
+
+def facts_as_recorded(record: Record, tick: int) -> dict[str, Any] | None:
+    """Collects all facts about the robot as recorded at a tick; None if they do not come out again as recorded.
+
+    Args:
+        record: Record of the run, for the method ``recorded``.
+        tick: Row of its motion.
+    """
+    if not record.read_as_recorded(tick):
+        return None
+    row = record.motion.iloc[tick]
+    speed, horizon, stop, apart = (_known(row[name]) for name in ("tcp_speed", "horizon_s", "tau_s", "distance_m"))
+    found: dict[str, Any] = {
+        "at_s": float(row["t_ns"] - record.motion["t_ns"].iloc[0]) * 1e-9,
+        "tick": tick,
+        "method": record.method,
+        "status": "as recorded",
+        "reason": str(row["reason"] or ""),
+        "tcp_speed_m_per_s": speed,
+        "horizon_s": horizon,
+        "tau_s": stop,
+        "cameras": _cameras(record, tick),
+        "beside": _beside(record.folder, tick),
+    }
+    if apart is not None:
+        found["nearest"] = {"link": str(row["link"]), "limb": str(row["limb"])}
+        found["nearest"] |= {"distance_m": apart, "overlap_m": float(row["overlap_m"])}
+    path = record.folder / "contact.parquet"
+    if path.is_file():
+        contact = pq.read_table(path, filters=[("method", "=", RECORDED), ("t_ns", "=", int(row["t_ns"]))]).to_pandas()
+        if len(contact) and np.isfinite(contact["distance_m"].iloc[0]):
+            body = contact.iloc[0]
+            found["body"] = {name: str(body[name]) for name in ("link", "limb", "source")}
+            found["body"] |= {"distance_m": float(body["distance_m"]), "moving": bool(body["moving"])}
+    return found | _objects(record, tick)
+
+
+def _known(value: float) -> float | None:
+    """Returns a number; None if it is unknown."""
+    return float(value) if np.isfinite(value) else None
+
+
+def _beside(folder: Path, tick: int) -> dict[str, dict[str, Any]]:
+    """Method -> what each controller of a run did at a tick."""
+    found = {}
+    for path in sorted(folder.glob("motion*.parquet")):
+        method = path.stem.removeprefix("motion").removeprefix("_") or resolve("plan", folder).settings.plan.method
+        if method != RECORDED:
+            row = pq.read_table(path, columns=["status", "reason", "tcp_speed"]).slice(tick, 1).to_pylist()[0]
+            found[method] = {"status": row["status"], "reason": row["reason"] or ""}
+            found[method] |= {"tcp_speed_m_per_s": row["tcp_speed"]}
     return found
 
 
@@ -347,12 +420,18 @@ def sentences(found: Mapping[str, Any]) -> list[str]:
     """
     lines = [f"{found['at_s']:.3f} s, tick {found['tick']}, {found['method']}: {_state(found)}."]
     lines += [f"Cause: {cause(found)}."]
-    if "nearest" in found:
+    if "nearest" in found and found["horizon_s"] is not None:
         near = found["nearest"]
         apart = f"{1e3 * near['overlap_m']:.1f} mm deep" if near["overlap_m"] else f"{1e3 * near['distance_m']:.1f} mm"
         lines.append(
             f"Nearest: {_pair(near)}, {apart}; volumes up to {1e3 * found['horizon_s']:.0f} ms after the tick."
         )
+    if "body" in found:
+        body = found["body"]
+        apart = f"{1e3 * body['distance_m']:.1f} mm between their surfaces"
+        lines.append(f"Recorded body ({body['source']}): {_pair(body)}, {apart}.")
+    for method, did in found.get("beside", {}).items():
+        lines.append(f"Beside it, {method}: {_state(did)}.")
     for near in (found[key] for key in ("nearest_object", "nearest_links") if key in found):
         lines.append(f"Nearest of the cell: {_pair(near)}, {1e3 * near['distance_m']:.1f} mm.")
     lines += [f"Active row: {_row(row)}, multiplier {row['multiplier']:.3g}." for row in _weighted(found)[1:]]
@@ -387,12 +466,16 @@ def _watched_text(since_s: Mapping[str, float | None]) -> str:
 
 def _state(found: Mapping[str, Any]) -> str:
     speed = found["tcp_speed_m_per_s"]
+    if speed is None:
+        return f"the robot is not known ({found['reason']})"
     moved = "the robot stood" if speed < _STANDS else f"the TCP moved at {speed:.3f} m/s"
     return f"{moved}, {found['status']}" + (f" ({found['reason']})" if found["reason"] else "")
 
 
 def cause(found: Mapping[str, Any]) -> str:
     """Returns the cause that limited the robot, as a sentence without its full stop."""
+    if found["method"] == RECORDED:
+        return "not known, as the log says where the robot was, not why"
     if found.get("conflict"):
         return f"no velocity keeps all of these: {'; '.join(_row(row) for row in found['conflict'])}"
     if found.get("refused"):
@@ -431,6 +514,8 @@ def _row(row: Mapping[str, Any]) -> str:
         return f"TCP {turn} {'xyz'[row['direction'] % 3]}, {row['side']} bound"
     if row["kind"] == "speed":
         return "TCP, the programme's speed limit"
+    if row["kind"] == "contact":
+        return f"{row['link']} may move at {row['speed_m_per_s']:.3f} m/s beside {neighbour_text(row['beside'])}"
     if row["kind"] == "path":
         return str(row["what"])
     if row["kind"] in ("object", "self"):

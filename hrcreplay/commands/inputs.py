@@ -14,7 +14,7 @@ from hrcreplay.errors import SettingsError
 from hrcreplay.logs import importers, info
 from hrcreplay.logs.motion_files import ImportMapping, import_motion
 from hrcreplay.logs.reader import open_log
-from hrcreplay.pipeline.run_config import robot_axes
+from hrcreplay.pipeline.run_config import robot_description
 from hrcreplay.settings.load import load_settings
 from hrcreplay.toml_file import read_toml, validate
 
@@ -23,7 +23,14 @@ _OWN_KINDS = ("azure", "kinect2", "keraal")
 _KERAAL_HZ = 30.0
 
 
-def describe(path: Path, config: Path | None, overrides: tuple[str, ...], cell_file: Path | None = None) -> list[str]:
+def describe(
+    path: Path,
+    config: Path | None,
+    overrides: tuple[str, ...],
+    cell_file: Path | None = None,
+    *,
+    as_json: bool = False,
+) -> list[str]:
     """Describes the content of a log, line by line.
 
     Args:
@@ -31,23 +38,26 @@ def describe(path: Path, config: Path | None, overrides: tuple[str, ...], cell_f
         config: Settings file; may be None.
         overrides: ``section.key=value`` of the command line; they override the file.
         cell_file: Poses and clock offsets of the cameras; they override the log's.
+        as_json: True: all of it as JSON.
 
     Raises:
         SettingsError: A setting cannot be used.
         LogError: The log cannot be read.
     """
     settings = load_settings(config, overrides)
+    robot = robot_description(settings.robot)
     cell = load_cell(cell_file) if cell_file is not None else Cell()
     log = open_log(path, settings.logs, skeletons=False)
     summary = info.summarize(
         log,
-        axes=robot_axes(settings.robot),
+        axes=robot.joints,
+        frames=robot.frames,
         options=settings.logs,
         T_world_camera=cell.T_world_camera,
         clock_offset_s=cell.clock_offset_s,
         T_world_base=cell.T_world_base,
     )
-    return info.lines(summary)
+    return [info.as_json(summary)] if as_json else info.lines(summary)
 
 
 def import_files(

@@ -19,6 +19,7 @@ import pyarrow.parquet as pq
 from hrcreplay.commands.notes import notes_of
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.pipeline import assembly, reuse, stages
+from hrcreplay.pipeline.robot_mass import robot_mass
 from hrcreplay.pipeline.run_config import RunConfig, RunOptions, resolve
 from hrcreplay.pipeline.stages import (
     ProgressBar,
@@ -216,7 +217,10 @@ def _describe_results(
     method = run_config.settings.plan.method
     motions = {} if robot is None or method == "none" else {str(method): folder / "motion.parquet"}
     notes = notes_of(folder, meta, told, motions, robot, run_config.settings.fusion.rate_hz)
-    return {"notes": notes} | ({} if robot is None else {"robot": tables.summary(robot)})
+    if robot is None:
+        return {"notes": notes}
+    mass = robot_mass(run_config.settings.robot, robot).source
+    return {"notes": notes, "robot": tables.summary(robot) | {"mass": mass}}
 
 
 def findings(run_config: RunConfig, told: Mapping[str, Told], reused: tuple[str, ...] = ()) -> dict[str, Any]:

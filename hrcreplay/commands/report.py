@@ -30,6 +30,7 @@ from hrcreplay.reporting.page import report_page
 from hrcreplay.reporting.page.replay_page import snapshot
 from hrcreplay.reporting.replay_scene import ReplayScene, replay_scene
 from hrcreplay.reporting.scene_mcap import foxglove_layout, write_scene
+from hrcreplay.reporting.severity import add_severity
 from hrcreplay.reporting.summary_text import lines
 from hrcreplay.reporting.tables import PageTable
 from hrcreplay.settings.sections import Logs, setting
@@ -185,6 +186,7 @@ def compute(run: Run, *, near_m: float, stationary_m_per_s: float, gap_s: float 
         recorded=run.recorded,
     )
     add_contact(metrics, run, stationary_m_per_s)
+    add_severity(metrics, run)
     return metrics.sorted()
 
 

@@ -20,6 +20,7 @@ import pyarrow.parquet as pq
 
 from hrcreplay.evaluation.containment import Outcome, coverage
 from hrcreplay.evaluation.recorded_person import BodyTrack, RecordedPeople, read_people
+from hrcreplay.evaluation.severity import severity_table
 from hrcreplay.geometry.distances import nearest_pair, protrusion_m
 from hrcreplay.human.model import LEG_PARTS, PARTS, part_radii
 from hrcreplay.logs.reader import Log
@@ -27,11 +28,11 @@ from hrcreplay.pipeline import assembly, stages
 from hrcreplay.pipeline.assembly import PredictionStage
 from hrcreplay.pipeline.person_fuser import PersonFuser
 from hrcreplay.pipeline.run_config import RunConfig
-from hrcreplay.records import BODY, RECORDED, UNGUARDED, Bools, Floats, HumanStates, Ints, SweptVolume
+from hrcreplay.records import ALLOWING_CONTACT, BODY, RECORDED, UNGUARDED, Bools, Floats, HumanStates, Ints, SweptVolume
 from hrcreplay.robot.model import LinkMotion, RobotModel
 from hrcreplay.robot.recorded import CapsuleSample, RecordedCapsules
 from hrcreplay.store.columns import Columns, body_columns, contact_columns, person_columns, read_states, state_columns
-from hrcreplay.store.run_folder import RunWriter
+from hrcreplay.store.run_folder import RunWriter, arrow_table
 
 _BATCH = 4096
 
@@ -84,7 +85,7 @@ def _smooth(run_config: RunConfig, log: Log, ticks_ns: Ints) -> Iterator[HumanSt
 
 
 def write_contact(run_config: RunConfig, log: Log, writer: RunWriter, T_world_base: Floats) -> None:
-    """Writes contact.parquet for every motion table of a run, and the recorded body for drawing.
+    """Writes contact.parquet and severity.parquet for every motion of a run, and the recorded body for drawing.
 
     Args:
         run_config: The run.
@@ -112,6 +113,8 @@ def write_contact(run_config: RunConfig, log: Log, writer: RunWriter, T_world_ba
             capsules, _ = assembly.recorded_capsules(log, T_world_base)
         rows = contact_table(run_config, robot, method, motion, people, predicted, own, full, capsules)
         writer.table("contact", rows)
+        meetings = arrow_table(rows).to_pandas()
+        writer.table("severity", severity_table(run_config, robot, method, motion, meetings, people, capsules))
     writer.close_tables()
 
 
@@ -209,12 +212,8 @@ def contact_table(
     person = _nearest_person(each, people)
     worst, of_other = choose_nearer(person, other)
     outside_m = np.full(len(t_ns), np.nan)
-    if method not in UNGUARDED:
+    if method not in (*UNGUARDED, *ALLOWING_CONTACT):
         outside_m = by_volume(motion, person, people, radii_m, prediction.hand_m, predicted)
-    sources = tuple(track.source for track in people.tracks)
-    if len(each) > 1:
-        named = [f"person {one.number}, {track.source}" for one in people.people for track in one.tracks]
-        sources = (*named, *sources[len(named) :])
     nobody: Coverage = [None] * len(each)
     pairs = zip(own or nobody, full or nobody, strict=True)
     of_each = [(_measure_left(a, t_ns), _measure_left(b, t_ns)) for a, b in pairs]
@@ -227,7 +226,7 @@ def contact_table(
         part=(worst.part, PARTS),
         link=(worst.link, links),
         speeds=(motion["tcp_speed"].to_numpy(dtype=float), worst.speed),
-        source=(np.where(of_other, len(people.person) + worst.track, worst.track), sources),
+        source=(np.where(of_other, len(people.person) + worst.track, worst.track), people.names),
         apart=(person.distance_m, other.distance_m),
         outside_m=outside_m,
         left=(*_worst_left([a for a, _ in of_each]), BODY),

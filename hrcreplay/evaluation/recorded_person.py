@@ -143,6 +143,14 @@ class RecordedPeople:
         return (*self.person, *self.others)
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """Name of the source of each track of ``tracks``, with the person's number where there are several people."""
+        if len(self.people) == 1:
+            return tuple(track.source for track in self.tracks)
+        named = [f"person {one.number}, {track.source}" for one in self.people for track in one.tracks]
+        return (*named, *(track.source for track in self.others))
+
+    @property
     def numbers(self) -> Ints:
         """(k,) number of the person of each track of ``person``."""
         return np.array([one.number for one in self.people for _ in one.tracks], dtype=np.int64)

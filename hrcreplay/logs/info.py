@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
+import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +20,7 @@ from hrcreplay.logs.cleaning import PersonMemory, select_person
 from hrcreplay.logs.clocks import late_remark
 from hrcreplay.logs.joints import Clock
 from hrcreplay.logs.reader import DEFAULT, Log
-from hrcreplay.records import CameraFrames, Floats, SkeletonTrack
+from hrcreplay.records import AxisFrame, CameraFrames, Floats, SkeletonTrack
 from hrcreplay.settings.sections import Logs
 
 
@@ -121,6 +124,7 @@ def summarize(
     log: Log,
     *,
     axes: Sequence[str] = (),
+    frames: Sequence[AxisFrame] = (),
     options: Logs = DEFAULT,
     T_world_camera: Mapping[str, Floats] | None = None,
     clock_offset_s: Mapping[str, float] | None = None,
@@ -131,6 +135,7 @@ def summarize(
     Args:
         log: An open log; also one without skeletons (``open_log(path, options, skeletons=False)``).
         axes: The robot's joints, to match the joints of the log to axes; () if unknown.
+        frames: Links at both sides of each axis: a log without joint states is searched for their poses; () if unknown.
         options: Settings of the person selection.
         T_world_camera: (4, 4) poses from a cell; they have priority over those of the log.
         clock_offset_s: Each camera's clock minus the reference camera's, from a cell [s].
@@ -146,10 +151,10 @@ def summarize(
     cell = T_world_camera or {}
     poses = {**known, **cell}
     person = _PersonInWorld(log, poses, clock_offset_s or {}, options)
-    for frames in log.frames():
-        _count(frames, tallies)
-        person.add(frames)
-    joint_topics, joint_notes = _joints(log, axes)
+    for seen in log.frames():
+        _count(seen, tallies)
+        person.add(seen)
+    joint_topics, joint_notes = _joints(log, axes, frames)
     recorded = _recorded(log, joint_topics)
     cameras = tuple(
         _camera(name, tally, log, "the cell" if name in cell else "the log" if name in poses else "none")
@@ -220,13 +225,16 @@ class _PersonInWorld:
         self.checks.add(mine.camera, track)
 
 
-def _joints(log: Log, axes: Sequence[str]) -> tuple[tuple[JointSummary, ...], tuple[str, ...]]:
+def _joints(
+    log: Log, axes: Sequence[str], frames: Sequence[AxisFrame]
+) -> tuple[tuple[JointSummary, ...], tuple[str, ...]]:
     """Returns the topics of the robot's joints, and remarks on their reading or its failure."""
     states, reading = log.joint_states(), None
     notes: tuple[str, ...] = ()
-    if states and axes:
+    if axes:
         try:
-            reading = log.read_joints(states, axes)
+            states = states or log.link_states(axes, frames)
+            reading = log.read_joints(states, axes) if states else None
             notes = log.joint_notes
         except (LogError, SettingsError) as error:
             notes = (str(error).removeprefix(f"{log.header.path}: "),)
@@ -306,6 +314,24 @@ def _missing(
         yield "the robot's base pose: give a cell file with --cell"
     if header.task is None and not joint_topics:
         yield "the robot's task: name a task file with --set plan.task=FILE"
+
+
+def as_json(summary: Summary) -> str:
+    """Returns the summary as JSON: the fields of ``Summary``, null for unknown numbers, and the span in seconds."""
+    return json.dumps(_plain(asdict(summary) | {"span_s": summary.span_s}), indent=2, allow_nan=False)
+
+
+def _plain(value: Any) -> Any:
+    """Returns a value in types that JSON has."""
+    if isinstance(value, dict):
+        return {str(name): _plain(part) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(part) for part in value]
+    if isinstance(value, np.generic | np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return str(value) if isinstance(value, Path) else value
 
 
 def lines(summary: Summary) -> list[str]:

@@ -74,6 +74,7 @@ class JointTopic:
     arrival_ns: Ints  #: (m,)
     stamp_ns: Ints  #: (m,) 0 where a message has none
     joints: Mapping[str, Samples]  #: by name, in order of appearance; unnamed joints are '#1', '#2', ...
+    by_links: bool = False  #: True: read from the poses of the robot's links
 
 
 @dataclass(frozen=True)
@@ -202,7 +203,7 @@ def read_frames(
         axis: Samples(_ints(rows), _unwrapped(np.array(values)), np.full(len(values), np.nan))
         for axis, (rows, values) in found.items()
     }
-    return JointTopic(", ".join(names), _ints(arrival), _ints(stamp), series)
+    return JointTopic(", ".join(names), _ints(arrival), _ints(stamp), series, by_links=True)
 
 
 def _unwrapped(q: Floats) -> Floats:

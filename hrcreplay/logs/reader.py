@@ -392,24 +392,37 @@ class Log:
             LogError: The joints of the log do not fit the robot.
             SettingsError: ``logs.joint_names`` does not.
         """
-        topics = self.joint_states()
-        if not topics and frames:
-            names = [topic.name for topic in self.topics if topic.type in TF_TYPES]
-            defects: Counter[str] = Counter()
-            by_links = joints.read_frames(self._source, names, axes, frames, defects) if names else None
-            if by_links is not None:
-                self._track.update(defects)
-                track = self.read_joints([by_links], axes).track
-                told = f"from the poses of its links on {by_links.name}, each first within half a turn of 0"
-                self.joint_notes = (f"robot joints: {told}", *self.joint_notes)
-                return track
+        topics = self.joint_states() or self.link_states(axes, frames)
         return self.read_joints(topics, axes).track if topics else None
+
+    def link_states(self, axes: Sequence[str], frames: Sequence[AxisFrame]) -> list[JointTopic]:
+        """Returns the robot's axes by the poses of its links, for a log without joint states; none if a link lacks one.
+
+        Args:
+            axes: The robot's joints, from the base on.
+            frames: Links at both sides of each axis; none: there is nothing to search for.
+
+        Raises:
+            LogError: A link turns about another axis than that of the robot.
+        """
+        names = [topic.name for topic in self.topics if topic.type in TF_TYPES] if frames else []
+        defects: Counter[str] = Counter()
+        found = joints.read_frames(self._source, names, axes, frames, defects) if names else None
+        if found is None:
+            return []
+        self._track.update(defects)
+        return [found]
 
     def read_joints(self, topics: Sequence[JointTopic], axes: Sequence[str]) -> JointReading:
         """Makes the track of the robot's axes from the result of ``joint_states``; raises as ``joints``."""
         reading = joints.read_track(topics, axes, self._options, str(self.header.path), self._track)
         covered = joints.coverage_remarks(reading, self.header.start_ns, self.header.end_ns)
-        self.joint_notes = (*reading.notes, *covered)
+        told = [
+            f"robot joints: from the poses of its links on {topic.name}, each first within half a turn of 0"
+            for topic in topics
+            if topic.by_links
+        ]
+        self.joint_notes = (*told, *reading.notes, *covered)
         return reading
 
     def joint_states(self) -> list[JointTopic]:

@@ -26,8 +26,10 @@ from hrcreplay.logs.capsule_track import CapsuleTrack
 from hrcreplay.logs.cleaning import PersonMemory, select_person
 from hrcreplay.logs.joints import JointTrack
 from hrcreplay.logs.log_files import Header
+from hrcreplay.pipeline.robot_mass import contact_speeds
 from hrcreplay.pipeline.run_config import RunConfig, UrdfFiles, link_capsules
 from hrcreplay.records import (
+    ALLOWING_CONTACT,
     BORDER,
     NOBODY,
     OF_PERSON,
@@ -659,7 +661,12 @@ def robot_base(run_config: RunConfig, log: LogLike) -> Floats:
 
 def plan_settings(run_config: RunConfig, dt_s: float, method: str) -> PlanSettings:
     """Returns the settings of Section 5 for ticks of ``dt_s`` [s] and a method."""
-    plan, prediction = run_config.settings.plan, prediction_stage(run_config).settings
+    plan, stage = run_config.settings.plan, prediction_stage(run_config)
+    prediction, area = stage.settings, watched_area(run_config)
+    contact = None
+    if method in ALLOWING_CONTACT:
+        sides = 0 if area is None else len(area.polygon.normals)
+        contact = contact_speeds(run_config.settings, stage.limbs, sides)
     return PlanSettings(
         plan,
         dt_s=dt_s,
@@ -668,6 +675,7 @@ def plan_settings(run_config: RunConfig, dt_s: float, method: str) -> PlanSettin
         spare_ticks=int(run_config.command == "live"),
         certified=plan.certify and method not in UNGUARDED,
         retreat_m=plan.retreat_m if plan.certify and method == "qp" else 0.0,
+        contact=contact,
     )
 
 

@@ -42,15 +42,6 @@ class UrdfFiles:
     capsules: tuple[LinkSettings, ...] = ()  #: capsules of the links that a run has recorded: then no mesh is read
 
 
-def robot_axes(robot: Robot) -> tuple[str, ...]:
-    """Returns the joints of the robot in the settings, from the base on.
-
-    Raises:
-        SettingsError: The URDF cannot be used.
-    """
-    return robot_description(robot).joints
-
-
 def robot_description(robot: Robot) -> Description:
     """Returns the chain of the robot in the settings, with the limits of its axes.
 

@@ -20,6 +20,7 @@ from rich.console import Console
 from rich.table import Table
 
 from hrcreplay.records import RECORDED, UNGUARDED, Floats
+from hrcreplay.reporting import severity
 from hrcreplay.reporting.figures import drawing, planning
 from hrcreplay.reporting.metrics.contact import PERSONS, add_contact
 from hrcreplay.reporting.metrics.planning import PAPER, add_plan, is_moving
@@ -72,6 +73,7 @@ class LogResult:
     person: str  #: source of the recorded person, as in contact.parquet
     seconds: float
     notes: tuple[str, ...]
+    mass: str  #: source of the robot's mass, in words
     figures: Mapping[Variant, Mapping[str, Any]]
 
 
@@ -150,7 +152,19 @@ FIELDS = (
     Field("full_checked_ticks", "sum", "1", "the same until the braking time T_s, as in audit: ticks"),
     Field("full_held_ticks", "sum", "1", "of these, every limb that was seen stayed whole inside its volume"),
     Field("full_coverage", "full_held_ticks / full_checked_ticks", "1", "as audit counts it until T_s"),
+    Field("contacts", "sum", "1", "contacts of the moving robot with anybody recorded: stretches of ticks"),
+    Field("contacts_over", "sum", "1", "of these, with an estimated force above the limit if the part gives way"),
+    Field("contacts_over_clamped", "sum", "1", "of these, with an estimated force above the limit if it is clamped"),
+    Field("contact_energy_max_j", "max", "J", "largest energy that a contact transfers, estimated"),
+    Field(
+        "contact_force_share_max",
+        "max",
+        "1",
+        "largest estimated force of a short contact as a share of the body region's limit",
+    ),
 )
+#: What a variant has beside FIELDS: brakings by cause, and the row of severity.parquet of its worst contact.
+MORE = ("braking_events_by_cause", "worst_contact")
 #: Figures that are metrics of the report -> their names there, after ``plan_`` except for those of the volumes.
 _METRICS = {
     "ticks": "plan_ticks",
@@ -192,13 +206,16 @@ _OF_CONTROLLERS = (
 )
 
 
-def figures(variant: Variant, motion: pd.DataFrame, contact: pd.DataFrame, bounds: Bounds) -> dict[str, Any]:
-    """Computes the figures of a variant on one log: FIELDS, and ``braking_events_by_cause``; None if inapplicable.
+def figures(
+    variant: Variant, motion: pd.DataFrame, contact: pd.DataFrame, meetings: pd.DataFrame, bounds: Bounds
+) -> dict[str, Any]:
+    """Computes the figures of a variant on one log: FIELDS, MORE; None if inapplicable.
 
     Args:
         variant: The variant.
         motion: Its table of motion.
         contact: Its rows of contact.
+        meetings: Its rows of severity.
         bounds: Bounds from the settings.
     """
     metrics = _metrics(variant, motion, contact, bounds)
@@ -220,7 +237,8 @@ def figures(variant: Variant, motion: pd.DataFrame, contact: pd.DataFrame, bound
         found[f"{prefix}held_ticks"] = None if checked is None else checked - left
     if variant.method == RECORDED:
         found |= dict.fromkeys(_OF_CONTROLLERS)
-    return _add_ratios(found) | {"braking_events_by_cause": causes}
+    met = severity.summary(meetings)
+    return _add_ratios(found | met) | {"braking_events_by_cause": causes, "worst_contact": met["worst"]}
 
 
 def _metrics(variant: Variant, motion: pd.DataFrame, contact: pd.DataFrame, bounds: Bounds) -> dict[str, Metric]:
@@ -289,7 +307,9 @@ def total(each: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     for row in each:
         for cause, count in row["braking_events_by_cause"].items():
             causes[cause] = causes.get(cause, 0) + count
-    return _add_ratios(found) | {"braking_events_by_cause": dict(sorted(causes.items()))}
+    rows = [row["worst_contact"] for row in each if row["worst_contact"] is not None]
+    worst = severity.worst(pd.DataFrame(rows).astype(severity.NUMBERS)) if rows else None
+    return _add_ratios(found) | {"braking_events_by_cause": dict(sorted(causes.items())), "worst_contact": worst}
 
 
 def results(logs: Sequence[LogResult]) -> dict[str, Any]:
@@ -310,6 +330,7 @@ def results(logs: Sequence[LogResult]) -> dict[str, Any]:
                 "person": log.person,
                 "seconds": log.seconds,
                 "notes": list(log.notes),
+                "robot_mass": log.mass,
                 "methods": {variant.label: _select_told(figures, 1) for variant, figures in log.figures.items()},
             }
             for log in logs
@@ -404,7 +425,13 @@ def page_tables(found: Mapping[str, Any]) -> tuple[PageTable, ...]:
         named = tuple(cause or "unnamed" for cause in causes)
         note = "Times that a moving robot began to brake, by the reason at that tick."
         tables.append(PageTable("Brakings by cause", (*lead, *named), tuple(brakings), note))
-    return tuple(tables)
+    masses = dict.fromkeys(log["robot_mass"] for log in found["logs"])
+    met = {
+        f"{log}, {label}" if len(logs) > 1 else label: {**row, "worst": row["worst_contact"]}
+        for log, methods in logs
+        for label, row in methods.items()
+    }
+    return (*tables, severity.severity_table(met, "; ".join(masses)))
 
 
 def _note(found: Mapping[str, Any]) -> str:

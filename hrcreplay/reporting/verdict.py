@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hrcreplay.records import LIMBS, RECORDED
+from hrcreplay.records import ALLOWING_CONTACT, LIMBS, RECORDED
 from hrcreplay.reporting.metrics.contact import PERSONS, SHOWN_PARTS, method_prefixes
 from hrcreplay.reporting.metrics.fusion import add_limbs
 from hrcreplay.reporting.metrics.people import TRACKED
@@ -301,7 +301,8 @@ def _fault(metrics: Metrics) -> str:
         metrics[f"plan_touch_{name}_ticks"]["value"] for name in ("inside", "retreating", "outside", "unpredicted")
     )
     if inside is None:
-        return "; it does not react to people"
+        may = metrics["plan_method"]["value"] in ALLOWING_CONTACT
+        return "; it may touch people, slowly" if may else "; it does not react to people"
     parts = []
     if other := metrics["plan_touch_other_ticks"]["value"]:
         parts.append(f"at {other} it touched a body that it did not consider")

@@ -32,6 +32,11 @@ AXES = (
 )
 
 
+#: Mass of the robot, and its largest payload, of the product specification [kg]. The mass of the moving parts, their
+#: centres and their inertias are not published.
+MASS_KG, PAYLOAD_KG = 98.0, 6.0
+
+
 def urdf() -> str:
     """The robot as URDF text: links ``base``, ``link_1`` to ``link_6`` and ``flange`` (z out of the flange)."""
     rows = ["<robot name='irb140'>", "<link name='base'/>", "<link name='flange'/>"]

@@ -125,6 +125,38 @@ class RobotModel:
         """(s, 3, 3) rotations from the segments' bodies to the world, for joint positions (nv,) [rad]."""
         return self._kinematics.R_bodies(q)
 
+    @property
+    def inertial(self) -> bool:
+        """Whether every axis of the URDF moves a mass; without, the robot's inertia is not known."""
+        return self._kinematics.inertial
+
+    @property
+    def moving_mass_kg(self) -> float:
+        """Mass of everything that the axes move, by the inertias of the URDF; NaN without them [kg]."""
+        return self._kinematics.moving_mass_kg if self.inertial else math.nan
+
+    def effective_mass_kg(
+        self, q: Floats, link: int, point_m: Floats, normal: Floats, payload_kg: float = 0.0
+    ) -> float:
+        """Mass that a contact meets along its normal: 1 / (n^T J M^-1 J^T n), Khatib (1995), with free axes.
+
+        The inertia of the motors behind their gears is in no URDF, and not in it.
+
+        Args:
+            q: (nv,) [rad].
+            link: Segment that is hit.
+            point_m: (3,) point of contact, world [m].
+            normal: (3,) unit vector, world.
+            payload_kg: Point mass at the TCP [kg].
+
+        Returns:
+            inf for a direction in which the robot cannot give way; NaN without inertias in the URDF.
+        """
+        if not self.inertial:
+            return math.nan
+        gives_way = self._kinematics.mobility(q, link, (point_m, normal), payload_kg)
+        return 1.0 / gives_way if gives_way > 0.0 else math.inf
+
     def link_motion(self, q: Floats, dq: Floats) -> LinkMotion:
         """Positions and velocities of the segments at many instants.
 
@@ -164,6 +196,34 @@ class _Kinematics:
     def R_bodies(self, q: Floats) -> Floats:
         pin.framesForwardKinematics(self._model, self._data, q)
         return np.array(self._turns).reshape(-1, 3, 3)
+
+    @property
+    def inertial(self) -> bool:
+        return all(inertia.mass > 0.0 for inertia in list(self._model.inertias)[1:])
+
+    @property
+    def moving_mass_kg(self) -> float:
+        return float(sum(inertia.mass for inertia in list(self._model.inertias)[1:]))
+
+    def mobility(self, q: Floats, link: int, contact: tuple[Floats, Floats], payload_kg: float) -> float:
+        """Inverse of the effective mass at a contact [1/kg].
+
+        Args:
+            q: (nv,) [rad].
+            link: Segment that is hit.
+            contact: (3,) point in the world [m], and (3,) unit vector of the normal.
+            payload_kg: Point mass at the TCP [kg].
+        """
+        point, normal = contact
+        M = np.triu(pin.crba(self._model, self._data, q))
+        M = M + np.triu(M, 1).T
+        pin.computeJointJacobians(self._model, self._data, q)
+        pin.updateFramePlacements(self._model, self._data)
+        J_tcp = self._J[:3] + np.cross(self._J[3:], self._tcp[1], axis=0)
+        M += payload_kg * J_tcp.T @ J_tcp
+        J = (self._J[:3] + np.cross(self._J[3:], point, axis=0)) * self._moves[2 * link]
+        along = normal @ J
+        return float(along @ np.linalg.solve(M, along))
 
     def link_motion(self, q: Floats, dq: Floats) -> LinkMotion:
         moves = self._moves[::2].astype(float)

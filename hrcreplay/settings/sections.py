@@ -338,16 +338,22 @@ class Robot(Section):
     """Additional link segments for parts mounted at the tool; also for the IRB 140."""
     acceleration: tuple[Positive, ...] = ()
     """Joint acceleration limits [rad/s^2]; none: top speed / T_s of every axis."""
+    mass_kg: Positive | None = None
+    """Mass of the moving parts, for the force of a contact [kg]; none: by the inertias of the URDF, for the IRB 140 the
+    98 kg of the whole robot."""
+    payload_kg: NotNegative | None = None
+    """Mass of tool and workpiece that the URDF lacks [kg]; none: 0, for the IRB 140 its largest payload, 6 kg."""
 
 
 class Plan(Section):
     """Section 5: the trajectory generator."""
 
-    method: Literal["qp", "scaling", "shield", "ssm", "none"] = "qp"
+    method: Literal["qp", "scaling", "shield", "ssm", "pfl", "none"] = "qp"
     """qp: Eq. (66); scaling: the largest factor on the programmed speed under the same constraints [24]; shield: the
     programmed speed while the next stop is certified; ssm: stop and go by the protective separation
-    distance of ISO/TS 15066; none: the programme without reaction to people."""
-    baselines: tuple[Literal["qp", "scaling", "shield", "ssm", "none"], ...] = ("scaling", "none")
+    distance of ISO/TS 15066; pfl: power and force limiting of ISO/TS 15066, so slow near people that a contact keeps
+    its energy limit; none: the programme without reaction to people."""
+    baselines: tuple[Literal["qp", "scaling", "shield", "ssm", "pfl", "none"], ...] = ("scaling", "none")
     """Additional methods to run for comparison."""
     horizon: Literal["adaptive", "fixed"] = "adaptive"
     """Horizon of the volumes. adaptive: the end of the stop that would follow; fixed: always prediction.stop_s."""
@@ -374,6 +380,11 @@ class Plan(Section):
     """qp: weight of the return to the programmed joint positions, relative to the printed cost."""
     human_speed: Positive = 1.6
     """ssm: speed at which a person may approach, ISO 13855 [m/s]."""
+    contact_limbs: tuple[Literal["THX", "URA", "LRA", "ULA", "LLA", "LEGS"], ...] = (
+        *("THX", "URA", "LRA", "ULA", "LLA"),
+        "LEGS",
+    )
+    """pfl: limbs that the slow robot may touch; it stops before the others, and always before the head."""
     task: Path | None = None
     """Task file (TOML); none: the task in the log, else the joint track in the log."""
     waiting_s: Positive | Literal["keep"] = 0.5

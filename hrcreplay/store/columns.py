@@ -107,6 +107,12 @@ COLUMNS = {
         *("t_ns", "method", "person", "moving", "distance_m", "limb", "link", "tcp_speed", "contact_speed"),
         *("source", "person_m", "other_m", "outside_m", "left_m", "left_limb", "left_full_m", "left_full_limb"),
     ),
+    "severity": (
+        *("t_ns", "method", "kind", "duration_s", "source", "link", "limb", "region", "distance_m"),
+        *("robot_speed", "person_speed", "robot_kg", "robot_simple_kg", "person_kg", "stiffness_n_per_m"),
+        *("energy_j", "energy_simple_j", "energy_limit_j"),
+        *("transient_n", "transient_limit_n", "clamped_n", "clamped_limit_n"),
+    ),
 }
 
 

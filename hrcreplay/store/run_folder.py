@@ -13,7 +13,7 @@ import re
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
@@ -126,7 +126,7 @@ def _one_nan(column: Any) -> Any:
 
 @dataclass
 class RunWriter:
-    """Creates a run folder. Use as a context manager: a failure removes all written files.
+    """Creates a run folder. Use as a context manager: a failure removes all written files and new folders.
 
     Raises:
         SettingsError: The folder exists or cannot be created.
@@ -135,6 +135,7 @@ class RunWriter:
     folder: Path
     tables: dict[str, TableWriter] = field(default_factory=dict)
     timing: dict[str, Any] = field(default_factory=dict)
+    _made: list[Path] = field(default_factory=list)  #: folders above that it made, the innermost first
 
     @property
     def partial(self) -> Path:
@@ -148,10 +149,12 @@ class RunWriter:
             raise SettingsError(
                 f"{self.partial}: left by a run that is under way or was killed; remove it or name another --out"
             )
+        above = [path for path in self.partial.parents if not path.exists()]
         try:
             self.partial.mkdir(parents=True)
         except OSError as error:
             raise SettingsError(f"{self.folder}: cannot be made ({error.strerror}); name another --out") from error
+        self._made.extend(above)
         self.text("run.json", to_json({"complete": False}))
         return self
 
@@ -200,6 +203,9 @@ class RunWriter:
         finally:
             if self.partial.exists():
                 shutil.rmtree(self.partial)
+                for path in self._made:
+                    with suppress(OSError):  # another run has written there in the meantime
+                        path.rmdir()
 
 
 @dataclass(frozen=True)
@@ -216,6 +222,7 @@ class Run:
     occupancy: pd.DataFrame | None = None
     motion: pd.DataFrame | None = None
     contact: pd.DataFrame | None = None
+    severity: pd.DataFrame | None = None
     body: pd.DataFrame | None = None
     recorded: pd.DataFrame | None = None  #: motion of the robot as recorded
     baselines: dict[str, pd.DataFrame] = field(default_factory=dict)
@@ -311,6 +318,7 @@ def read(folder: Path, meta: dict[str, Any] | None = None, *, shown: bool = Fals
         occupancy=table("occupancy"),
         motion=table("motion"),
         contact=table("contact"),
+        severity=table("severity"),
         body=table("body"),
         recorded=table(f"motion_{RECORDED}"),
         baselines={name: found for name in baselines if (found := table(f"motion_{name}")) is not None},

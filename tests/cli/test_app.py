@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import json
+import os
+import shlex
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
+import typer
 
 from hrcreplay import __version__
 from hrcreplay.cli import app
+from hrcreplay.cli.commands import EXAMPLES
 from hrcreplay.commands import replay
 from tests.facts import tells
 from tests.logs import own
@@ -42,6 +50,83 @@ def test_help_lists_every_command(run: Run) -> None:
     assert code == 0
     for command in ("info", "import", "calibrate", "fuse", "predict", "plan", "report", "audit", "fit-limits", "demo"):
         assert f" {command} " in out
+
+
+def test_each_command_answers_h_with_an_example(run: Run) -> None:
+    commands: Any = typer.main.get_command(app.app)
+    assert set(EXAMPLES) == set(commands.commands)
+    for name, command in commands.commands.items():
+        code, out, _ = run(name, "-h")
+        assert (code, out) == run(name, "--help")[:2]
+        assert "--quiet" in out
+        for example in EXAMPLES[name]:
+            assert example in " ".join(out.split())
+            program, called, *arguments = shlex.split(example.split(" > ")[0])
+            assert (program, called) == ("hrcreplay", name)
+            command.make_context(name, arguments)  # raises where an option or a value is none
+
+
+def test_a_shell_completes_commands_options_and_values() -> None:
+    as_program = "import sys; sys.argv = ['hrcreplay']\nfrom hrcreplay.cli.app import main\nmain()"
+
+    def complete(words: str) -> list[str]:
+        asked = {"_HRCREPLAY_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(words.count(" "))}
+        env = {**os.environ, **asked}
+        program = [sys.executable, "-c", as_program]
+        return subprocess.run(program, env=env, capture_output=True, text=True, check=False).stdout.split()
+
+    assert complete("hrcreplay re") == ["report"]
+    assert complete("hrcreplay report --chunk") == ["--chunk-ticks"]
+    assert complete("hrcreplay import open") == ["openpose"]
+    assert complete("hrcreplay report a.mcap --limits p") == ["paper", "people"]
+    assert complete("hrcreplay settings fus") == ["fusion"]
+
+
+def test_quiet_says_the_result_alone_and_errors_still(run: Run) -> None:
+    assert run("fuse", DEMO, "--out", "here", *SHORT, "--quiet") == (0, "here\n", "")
+    code, out, err = run("fuse", DEMO, "--out", "here", *SHORT, "-q")
+    assert (code, out) == (2, "")
+    assert tells(err, "here", "exists already")
+    assert len(err.splitlines()) == 1
+
+
+def test_verbose_adds_versions_and_the_time_of_the_stages(run: Run) -> None:
+    _, _, usual = run("fuse", DEMO, "--out", "usual", *SHORT)
+    code, out, err = run("fuse", DEMO, "--out", "here", *SHORT, "-v")
+    assert (code, out) == (0, "here\n")
+    lines = err.splitlines()
+    assert usual.splitlines()[0] in lines
+    assert tells([lines[0]], "version", __version__, "Python")
+    timing = json.loads(Path("here/timing.json").read_text())
+    assert any(f"fuse: {timing['fuse']['ticks']} ticks" in line for line in lines)
+    assert lines[-1].startswith("hrcreplay: took ")
+    code, _, err = run("fuse", DEMO, "-q", "-v")
+    assert code == 2
+    assert tells(err, "--quiet", "--verbose", "one of them")
+
+
+def test_ctrl_c_says_interrupted_and_leaves_nothing(tmp_path: Path) -> None:
+    arguments = [
+        sys.executable,
+        "-m",
+        "hrcreplay",
+        "fuse",
+        str(DEMO),
+        "--out",
+        "deep/here",
+        "--set",
+        "fusion.rate_hz=1000",
+    ]
+    child = subprocess.Popen(arguments, cwd=tmp_path, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    until = time.monotonic() + 120.0
+    while not (tmp_path / "deep" / "here.partial").exists() and time.monotonic() < until:
+        time.sleep(0.02)
+    child.send_signal(signal.SIGINT)
+    out, err = child.communicate(timeout=120)
+    assert (child.returncode, out) == (130, "")
+    assert err.splitlines()[-1] == "hrcreplay: interrupted"
+    assert "Traceback" not in err
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_version(run: Run) -> None:
@@ -186,8 +271,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(run: Run, tmp_path: Path, case
     assert err.startswith("hrcreplay: ")
     assert message in err
     assert len(err.strip().splitlines()) <= 2
-    left = [path for path in sorted(tmp_path.rglob("*")) if path.name != "reports" and path.parent.name != "reports"]
-    assert left == before
+    assert sorted(tmp_path.rglob("*")) == before
 
 
 def test_a_log_without_extrinsics_says_how_to_get_them(run: Run) -> None:
@@ -210,3 +294,26 @@ def test_info_tells_what_the_demo_holds(run: Run) -> None:
     assert code == 0
     assert "kinect: 1563 frames at 29.98 Hz" in out
     assert "task     in the log" in out
+
+
+def test_info_as_json_holds_the_numbers_of_the_text(run: Run) -> None:
+    code, out, _ = run("info", DEMO, "--json")
+    assert code == 0
+    found, (_, text, _) = json.loads(out), run("info", DEMO)
+    assert found["path"] == str(DEMO)
+    assert found["has_task"]
+    assert f"span     {found['span_s']:.3f} s" in text
+    for camera in found["cameras"]:
+        assert f"{camera['name']}: {camera['frames']} frames at {camera['rate_hz']:.2f} Hz" in text
+    kinect, topics = found["cameras"][0], {topic["name"]: topic["messages"] for topic in found["topics"]}
+    assert topics[f"/camera/{kinect['name']}/skeleton"] >= kinect["frames"] == 1563
+    assert found["missing"] == []
+
+
+def test_the_values_that_a_shell_offers_are_those_that_there_are() -> None:
+    from hrcreplay.commands.inputs import _OWN_KINDS
+    from hrcreplay.logs.formats import FORMATS
+    from hrcreplay.settings.load import Settings
+
+    assert set(app.KINDS) == {*_OWN_KINDS, *FORMATS}
+    assert list(app.SECTIONS) == list(Settings.model_fields)

@@ -26,6 +26,7 @@ from hrcreplay.records import JOINTS, LENGTHS, POINTS, Floats, HumanStates, Ints
 from hrcreplay.reporting import comparison
 from hrcreplay.reporting.comparison import FIELDS, Variant
 from hrcreplay.reporting.figures import planning
+from hrcreplay.reporting.severity import NUMBERS
 from hrcreplay.settings.load import load_settings
 from hrcreplay.store import run_folder
 from hrcreplay.store.columns import read_states
@@ -279,9 +280,12 @@ def _all_inside(
 
 
 def test_logs_add_up() -> None:
+    hard = {"transient_n": 50.0, "transient_limit_n": 100.0, "robot_speed": 1.0, "person_speed": None, "link": "tool"}
     one = dict.fromkeys((field.name for field in FIELDS), 2.0) | {"ticks": 100, "braking_events_by_cause": {"a": 1}}
+    one["worst_contact"] = hard | dict.fromkeys(NUMBERS.keys() - hard.keys())
     two = {**one, "ticks": 300, "nearest_moving_m": -1.0, "touch_speed_m_per_s": None, "deviation_mean_m": 6.0}
     two |= {"jerk_rms_rad_per_s3": 6.0, "made_s": 1.0, "given_s": 4.0, "braking_events_by_cause": {"a": 2, "b": 5}}
+    two["worst_contact"] = one["worst_contact"] | {"transient_n": 10.0, "transient_limit_n": 15.0}
     both = comparison.total([one, two])
     assert both["ticks"] == 400
     assert both["touch_ticks"] == 4.0
@@ -291,6 +295,8 @@ def test_logs_add_up() -> None:
     assert both["jerk_rms_rad_per_s3"] == pytest.approx(math.sqrt((100 * 4 + 300 * 36) / 400))
     assert both["pace"] == pytest.approx(3.0 / 6.0)
     assert both["braking_events_by_cause"] == {"a": 3, "b": 5}
+    assert both["worst_contact"] == two["worst_contact"]  # a larger share of a smaller limit
+    assert comparison.total([one, {**two, "worst_contact": None}])["worst_contact"] == one["worst_contact"]
 
 
 CELL = "T_world_base = { position_m = [1.28, 0.0, 0.65], yaw_deg = 0.0 }\n"

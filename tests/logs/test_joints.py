@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -11,12 +12,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hrcreplay.errors import HrcReplayError, LogError, SettingsError
-from hrcreplay.logs.info import lines, summarize
+from hrcreplay.logs.info import as_json, lines, summarize
 from hrcreplay.logs.joints import JointTrack
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.records import AxisFrame, Floats, Ints
 from hrcreplay.settings.sections import Logs
-from tests.facts import facts
+from tests.facts import facts, tells
 from tests.logs.bags import KINDS, bag, header, make, write_openni
 
 BEGIN = 1_700_000_000_000_000_000
@@ -419,6 +420,27 @@ def test_the_poses_of_the_links_are_the_joints_where_a_log_has_no_joint_states(t
     np.testing.assert_allclose(track.q, [q_of(i) for i in range(100)], atol=1e-9)
     assert "from the poses of its links on /tf" in log.joint_notes[0]
     assert log.joints(AXES) is None
+
+
+def test_info_tells_of_a_robot_that_only_the_poses_of_its_links_show(tmp_path: Path) -> None:
+    path = write_links(tmp_path / "a", lambda i: np.array([0.01 * i, 0.2, -0.3]))
+    found = summarize(open_log(path), axes=AXES, frames=FRAMES)
+    (topic,) = found.joints
+    assert (topic.topic, topic.names) == ("/tf", tuple(AXES))
+    assert topic.axes == {axis: i for i, axis in enumerate(AXES, start=1)}
+    assert topic.rate_hz == pytest.approx(50.0)
+    assert found.recorded.startswith("by 3 joints: ")
+    assert any("from the poses of its links on /tf" in note for note in found.notes)
+    assert not any("task" in line for line in found.missing)  # its motion is the programme
+    assert json.loads(as_json(found))["joints"][0]["axes"] == topic.axes
+    without = summarize(open_log(path), axes=AXES)
+    assert (without.joints, without.recorded) == ((), "")
+    part = write_links(tmp_path / "b", lambda _: np.full(3, 0.3), links=2)
+    assert summarize(open_log(part), axes=AXES, frames=FRAMES).joints == ()
+    other = write_links(tmp_path / "c", lambda _: np.full(3, 0.3), turned=True)
+    refused = summarize(open_log(other), axes=AXES, frames=FRAMES)
+    assert refused.joints == ()
+    assert tells(refused.notes, "link_2", "robot.urdf")
 
 
 def test_links_that_are_not_all_there_are_no_robot_and_those_of_another_are_refused(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,8 +18,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
-from hrcreplay.commands import compare, replay, report
-from hrcreplay.errors import LogError
+from hrcreplay.commands import compare, explain, replay, report
+from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.evaluation.recorded_person import RecordedPeople, read_people
 from hrcreplay.human.model import part_radii
 from hrcreplay.logs.reader import open_log
@@ -32,7 +33,7 @@ from hrcreplay.robot.recorded import RecordedCapsules, RecordedJoints
 from hrcreplay.settings.sections import Settings
 from hrcreplay.store import run_folder
 from hrcreplay.store.columns import read_states
-from tests.facts import facts
+from tests.facts import facts, tells
 from tests.realdata import data_path
 from tests.test_recordings import SARA, SARA_CELL, TASK
 from tests.undrawn import undrawn
@@ -281,6 +282,57 @@ def recorded_of(log: Path, *overrides: str, **options: Any) -> tuple[RecordedJoi
     programme = assembly.programme(run_config, opened, model)
     assert not isinstance(programme.recorded, RecordedCapsules)
     return programme.recorded, programme
+
+
+def test_why_tells_where_the_recorded_robot_was_and_what_a_controller_did(ran: Ran, tmp_path: Path) -> None:
+    t_ns, touching = ran.contact["t_ns"].to_numpy(), (ran.contact["distance_m"] <= 0.0) & ran.contact["moving"]
+    at_s = float(t_ns[np.flatnonzero(touching)[5]] - t_ns[0]) * 1e-9
+    found = explain.explain(ran.folder, at_s, "recorded")
+    row, body = ran.recorded.iloc[found["tick"]], ran.contact.iloc[found["tick"]]
+    assert (found["method"], found["status"]) == ("recorded", "as recorded")
+    assert found["tcp_speed_m_per_s"] == row["tcp_speed"]
+    assert found["nearest"] == {
+        "link": row["link"],
+        "limb": row["limb"],
+        "distance_m": row["distance_m"],
+        "overlap_m": row["overlap_m"],
+    }
+    assert found["body"]["distance_m"] == body["distance_m"] <= 0.0
+    assert (found["body"]["link"], found["body"]["limb"], found["body"]["moving"]) == (body["link"], body["limb"], True)
+    own = pq.read_table(ran.folder / "motion.parquet").to_pandas().iloc[found["tick"]]
+    assert found["beside"] == {
+        "scaling": {"status": own["status"], "reason": own["reason"], "tcp_speed_m_per_s": own["tcp_speed"]}
+    }
+    said = explain.sentences(found)
+    assert tells(said, "recorded", "TCP moved", "as recorded")
+    assert tells(said, "Cause", "not known", "log")
+    assert tells(said, "Recorded body", body["source"], body["link"])
+    assert tells(said, "Beside it, scaling")
+    gap_s = (GAP_S[0] + GAP_S[1]) / 2.0 - FIRST_S
+    unknown = explain.explain(ran.folder, gap_s, "recorded")
+    assert json.loads(json.dumps(unknown, allow_nan=False))["tcp_speed_m_per_s"] is None
+    assert tells(explain.sentences(unknown), "not known", "gap in the robot states")
+    spoiled = tmp_path / "run"
+    shutil.copytree(ran.folder, spoiled)
+    table = ran.recorded.copy()
+    table.loc[found["tick"], "q1"] += 1e-12
+    table.to_parquet(spoiled / "motion_recorded.parquet")
+    with pytest.raises(SettingsError, match=facts("could not be reproduced")):
+        explain.explain(spoiled, at_s, "recorded")
+
+
+def test_the_contact_of_the_recorded_robot_has_its_severity(ran: Ran) -> None:
+    found = pq.read_table(ran.folder / "severity.parquet").to_pandas()
+    found = found[found["method"] == "recorded"]
+    touching = (ran.contact["distance_m"] <= 0.0) & ran.contact["moving"]
+    within = ran.contact["t_ns"][touching]
+    assert len(found)
+    assert found["t_ns"].isin(within).all()
+    metrics = json.loads((ran.folder / "metrics.json").read_text())
+    assert metrics["recorded_contacts"]["value"] == len(found)
+    energy = metrics["recorded_contact_energy_max_j"]["value"]
+    assert energy == pytest.approx(found["energy_simple_j"].max())
+    assert energy > 0.0
 
 
 def test_another_order_in_the_messages_changes_nothing(ran: Ran, tmp_path: Path) -> None:

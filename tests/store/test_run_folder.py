@@ -47,6 +47,19 @@ def test_digest_is_that_of_the_system_tool(tmp_path: Path) -> None:
     assert run_folder.sha256(path) == expected
 
 
+def test_a_failed_run_leaves_no_empty_folders_but_those_of_others(tmp_path: Path) -> None:
+    (tmp_path / "kept").mkdir()
+    for name in ("kept/deep/run", "reports/log/run"):
+        with pytest.raises(ZeroDivisionError), run_folder.RunWriter(tmp_path / name) as run:
+            run.table("state", _columns(0, 10))
+            raise ZeroDivisionError
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["kept"]
+    with pytest.raises(ZeroDivisionError), run_folder.RunWriter(tmp_path / "reports/log/run"):
+        (tmp_path / "reports/other").mkdir()  # by another run
+        raise ZeroDivisionError
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["kept", "other", "reports"]
+
+
 def test_a_run_appears_whole(tmp_path: Path) -> None:
     folder = tmp_path / "deep" / "run"
     with run_folder.RunWriter(folder) as run:

@@ -118,8 +118,9 @@ def start_table(run_config: RunConfig, header: Header, *, sending: bool) -> dict
         raise SettingsError(
             f"{header.path}: no task; a live robot needs one: name a task file with --set plan.task=FILE"
         )
-    if run_config.settings.plan.method == "none":
-        raise SettingsError("plan.method: none looks at nobody; a live robot needs qp, scaling, shield or ssm")
+    if (method := run_config.settings.plan.method) in ("none", "pfl"):
+        why = "looks at nobody" if method == "none" else "may touch people"
+        raise SettingsError(f"plan.method: {method} {why}; a live robot needs qp, scaling, shield or ssm")
     known, scene = run_config.meta(), HeaderOnlyLog(header)
     T_world_base, fusion_stage = assembly.robot_base(run_config, scene), assembly.fusion_stage(run_config, scene)
     robot = assembly.robot(run_config, T_world_base)

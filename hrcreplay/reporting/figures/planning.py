@@ -336,6 +336,7 @@ _COLOURS = {
     "scaling": drawing.ORANGE,
     "shield": drawing.GREEN,
     "ssm": drawing.PURPLE,
+    "pfl": drawing.SKY,
     "none": drawing.VERMILLION,
     RECORDED: drawing.INK,
 }

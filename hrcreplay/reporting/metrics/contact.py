@@ -11,9 +11,10 @@ import numpy as np
 import pandas as pd
 
 from hrcreplay.evaluation.contact import deciding_rows
-from hrcreplay.records import RECORDED, UNGUARDED, Bools, Floats, Ints
+from hrcreplay.evaluation.severity import merged_runs
+from hrcreplay.records import ALLOWING_CONTACT, RECORDED, Bools, Floats, Ints
 from hrcreplay.reporting.metrics.planning import is_moving, method_text, numeric_column
-from hrcreplay.reporting.metrics.series import MetricTable, durations_s, times, true_runs
+from hrcreplay.reporting.metrics.series import MetricTable, durations_s, times
 from hrcreplay.settings.sections import setting
 from hrcreplay.store.run_folder import Run
 
@@ -22,6 +23,11 @@ PERSONS = {
     "ground truth": "the ground truth of the log",
     "camera points": "the points of every camera and the smoothed person, of which the nearest counts",
     "smoothed estimate": "the smoothed person",
+}
+#: Method -> why its contacts are no fault of controller or prediction.
+_BLIND = {
+    "none": "the programme without reaction uses no volumes",
+    **dict.fromkeys(ALLOWING_CONTACT, "the method may touch people"),
 }
 _NOT_COMPARED = "the run has no table of contact"
 #: Limbs that must be known of a recorded person, and the parts of the body that show them.
@@ -79,7 +85,7 @@ def add_contact(metrics: MetricTable, run: Run, slow_m_per_s: float) -> None:
             _add_touch(metrics, prefix, rows, what)
             _add_nearest(metrics, prefix, rows, what)
             if prefix != RECORDED:
-                _add_faults(metrics, prefix, rows, what, motion, blind=method in UNGUARDED)
+                _add_faults(metrics, prefix, rows, what, motion, blind=_BLIND.get(method, ""))
     if run.contact is not None:
         _add_left(metrics, run.contact)
 
@@ -253,9 +259,9 @@ def retreats(motion: pd.DataFrame, t_ns: Ints) -> Bools:
 
 
 def _add_faults(
-    metrics: MetricTable, prefix: str, rows: pd.DataFrame, what: str, motion: pd.DataFrame, *, blind: bool
+    metrics: MetricTable, prefix: str, rows: pd.DataFrame, what: str, motion: pd.DataFrame, *, blind: str
 ) -> None:
-    """Classifies the contacts while moving: inside or outside the predicted volumes."""
+    """Classifies contacts while moving: inside or outside the predicted volumes; ``blind``: why they are neither."""
     touch = (numeric_column(rows, "person_m") <= 0.0) & rows["moving"].to_numpy(dtype=bool)
     outside, retreat = numeric_column(rows, "outside_m")[touch], retreats(motion, times(rows)[touch])
     inside = outside <= 0.0
@@ -278,7 +284,7 @@ def _add_faults(
             None if blind else int(which.sum()),
             "1",
             f"ticks of {what} with a moving link in contact with a part of the person that was {meaning}",
-            reason="the programme without reaction uses no volumes",
+            reason=blind,
         )
 
 
@@ -330,10 +336,6 @@ def _add_left(metrics: MetricTable, contact: pd.DataFrame) -> None:
         )
 
 
-#: Two events of one kind with a shorter gap are merged [s].
-_MERGED_S = 0.2
-
-
 @dataclass(frozen=True)
 class StopEvent:
     """A full stop, or a contact of the moving robot with the body."""
@@ -373,7 +375,7 @@ def _stops(motion: pd.DataFrame, t0_ns: int, slow: float) -> list[StopEvent]:
     speed, distance = (numeric_column(motion, name) for name in ("tcp_speed", "distance_m"))
     stopping = braking & moving
     found = []
-    for first, last in _merged(stopping, t_ns):
+    for first, last in merged_runs(stopping, t_ns):
         goes_on = np.flatnonzero(moving[last:])
         again = last + int(goes_on[0]) if len(goes_on) else len(t_ns)
         row = motion.iloc[first]
@@ -398,7 +400,7 @@ def _touches(contact: pd.DataFrame, t0_ns: int) -> list[StopEvent]:
     distance, speed = (numeric_column(contact, name) for name in ("distance_m", "contact_speed"))
     touching = contact["moving"].to_numpy(dtype=bool) & (distance <= 0.0)
     found = []
-    for first, last in _merged(touching, t_ns):
+    for first, last in merged_runs(touching, t_ns):
         at = first + int(np.nanargmin(np.where(touching[first:last], distance[first:last], np.inf)))
         row = contact.iloc[at]
         found.append(
@@ -414,17 +416,6 @@ def _touches(contact: pd.DataFrame, t0_ns: int) -> list[StopEvent]:
                 reason="",
             )
         )
-    return found
-
-
-def _merged(mask: Bools, t_ns: Ints) -> list[tuple[int, int]]:
-    """Returns runs of True as (first, past the last), without short gaps between them."""
-    found: list[tuple[int, int]] = []
-    for first, last in true_runs(mask).tolist():
-        if found and t_ns[first] - t_ns[found[-1][1] - 1] <= _MERGED_S * 1e9:
-            found[-1] = (found[-1][0], last)
-        else:
-            found.append((first, last))
     return found
 
 

@@ -20,6 +20,7 @@ from hrcreplay.reporting.metrics.fusion import cameras
 from hrcreplay.reporting.metrics.series import Metric
 from hrcreplay.reporting.page.replay_page import replay_part
 from hrcreplay.reporting.replay_scene import ReplayScene
+from hrcreplay.reporting.severity import severity_tables
 from hrcreplay.reporting.summary_text import defect_notes
 from hrcreplay.reporting.tables import (
     CAMERA,
@@ -213,6 +214,7 @@ def _plan(
             _figures(figures_dir, "safety", people),
             (
                 compare("Safety, per method on the same volumes", metrics, ran | plans, PLAN_SAFETY),
+                *severity_tables(run),
                 *_reasons(metrics, plans),
                 *stops,
             )

@@ -21,6 +21,7 @@ from hrcreplay.robot.control.controllers import (
     Controller,
     Observation,
     PathController,
+    PflController,
     QpController,
     ScalingController,
     SsmController,
@@ -71,6 +72,8 @@ def propose_explained(controller: Controller, context: TickContext) -> tuple[Pro
     if isinstance(controller, QpController):
         return _by_program(controller, context.seen)
     proposals = controller.propose(context.seen)
+    if isinstance(controller, PflController):
+        return proposals, {"binding": controller.slowest(context.seen)}
     if isinstance(controller, SsmController):
         return proposals, _protective(controller, context.seen)
     if isinstance(controller, ScalingController):

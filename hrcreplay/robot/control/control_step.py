@@ -17,6 +17,7 @@ import numpy as np
 
 from hrcreplay.kernels import njit
 from hrcreplay.records import Floats, MotionRow
+from hrcreplay.robot.control.contact_speed import ContactSpeeds
 from hrcreplay.robot.control.separation import Obstacles, Separation, separation
 from hrcreplay.robot.model import RobotModel, RobotPose
 from hrcreplay.robot.task import Grid, place
@@ -213,6 +214,7 @@ class PlanSettings:
     spare_ticks: int = 0  #: number of further ticks in which the volumes of a tick may be used
     certified: bool = True  #: whether a step must be certified
     retreat_m: float = 0.0  #: largest depth inside a volume from which a robot may move out of it [m]
+    contact: ContactSpeeds | None = None  #: speeds at which links may touch limbs; None: they must not
 
     def horizon_s(self, stop: Stop) -> float:
         """Required horizon of a tick's volumes: the end of the stop that follows the step [s].

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from hrcreplay.geometry.vectors import norm_n
 from hrcreplay.records import Ints, Motion
 from hrcreplay.robot.control import path_controller, qp_controller
 from hrcreplay.robot.control.certificate import NO_PLANES, decide
+from hrcreplay.robot.control.contact_speed import SLOW, end_speeds, pair_speeds, select
 from hrcreplay.robot.control.control_step import (
     NO_SOLUTION,
     NOT_FINITE,
@@ -35,7 +36,7 @@ from hrcreplay.robot.control.qp_controller import QpContext
 from hrcreplay.robot.control.separation import Obstacles
 from hrcreplay.robot.control.static_obstacles import StaticObstacles
 from hrcreplay.robot.model import RobotModel
-from hrcreplay.robot.task import Reference, ReferencePoint, advance, tcp_speed_cap
+from hrcreplay.robot.task import Reference, ReferencePoint, advance, place, tcp_speed_cap
 
 
 class ControllerTick(NamedTuple):
@@ -200,12 +201,58 @@ class SsmController(PathController):
         )
 
 
+class PflController(PathController):
+    """Power and force limiting, ISO/TS 15066: may touch some limbs, as slowly as they bear; stops before the others.
+
+    No certificate says that it keeps clear of all volumes, so none is recorded.
+    """
+
+    def step(self, predict: Predict) -> ControllerTick:
+        """One tick."""
+        tick = super().step(predict)
+        return tick._replace(step=replace(tick.step, certified=False))
+
+    def observe(self, predict: Predict) -> Observation:
+        """The people at the tick: the robot's distances from all of them, and the volumes that it must not touch."""
+        seen = super().observe(predict)
+        self.speeds = self.settings.contact.speeds(seen.obstacles)  # type: ignore[union-attr]
+        self.beside = [seen.obstacles.index(k) for k in range(len(self.speeds))]
+        return seen._replace(obstacles=select(seen.obstacles, np.isnan(self.speeds)))
+
+    def propose(self, seen: Observation) -> Proposals:
+        """The step with the largest allowed rate along the path, and the stop after it."""
+        sight, settings = seen.sight, self.settings
+        guarded = observe(self.robot, self.state, seen.obstacles, settings.plan.clearance_m, sight.pose)
+        reason = sight.reason or standstill_reason(guarded, settings)
+        if reason or sight.pairs is None:
+            return reason
+        if np.isnan(self.stop.along[0, 0]):
+            return NO_SOLUTION  # continue the stop of another method
+        limits = pair_speeds(sight.pairs, self.speeds, seen.horizon_s).min(axis=1, initial=np.inf)
+        return path_controller.propose(
+            self.robot, self.reference, self.stop, sight, None, seen.horizon_s, settings, limits
+        )
+
+    def slowest(self, seen: Observation) -> list[dict[str, Any]]:
+        """The link and the volume, by its place among all possible volumes, that bound the rate; none without one."""
+        if seen.sight.pairs is None or np.isnan(self.stop.along[0, 0]):
+            return []
+        limits = pair_speeds(seen.sight.pairs, self.speeds, seen.horizon_s)
+        towards = place(self.reference.grid, float(self.stop.along[0, 0]))[1]
+        moving = end_speeds(seen.sight.pose, towards)
+        link, volume = divmod(int(np.argmin(limits / np.maximum(moving, SLOW)[:, None])), limits.shape[1])
+        if moving[link] <= limits[link, volume]:
+            return []
+        return [{"kind": "contact", "link": link, "volume": self.beside[volume], "speed_m_per_s": limits[link, volume]}]
+
+
 #: Method -> its controller.
 CONTROLLERS: dict[str, type[Controller]] = {
     "qp": QpController,
     "scaling": ScalingController,
     "shield": PathController,
     "ssm": SsmController,
+    "pfl": PflController,
     "none": BlindController,
 }
 

@@ -3,6 +3,7 @@
 - ``scaling`` [24]: the largest share of the programmed speed that meets the rows of Eq. (66i).
 - ``shield``: the programmed speed while the next stop is certified, otherwise the stop.
 - ``ssm``: stop and go by the protective separation distance of ISO/TS 15066, 5.5.4.
+- ``pfl``: so slow near people that a contact keeps the limits of ISO/TS 15066, A.3; the stop before their heads.
 - ``none``: the programmed speed, without regard to people.
 """
 
@@ -18,6 +19,7 @@ from hrcreplay.geometry.small_matrices import apply
 from hrcreplay.kernels import njit
 from hrcreplay.records import Floats
 from hrcreplay.robot.control import control_step
+from hrcreplay.robot.control.contact_speed import largest_rate
 from hrcreplay.robot.control.control_step import PlanSettings, Proposal, Proposals, Sight, Stop, stop_along_path
 from hrcreplay.robot.control.qp_controller import cartesian_bounds
 from hrcreplay.robot.control.separation import Obstacles, tick_rows, worst_rows
@@ -50,6 +52,7 @@ def propose(
     obstacles: Obstacles | None,
     horizon_s: float,
     settings: PlanSettings,
+    link_speeds: Floats | None = None,
 ) -> Proposals:
     """One tick: the largest rate in [0, 1] that meets the limits of the robot and, with ``obstacles``, Eq. (66i).
 
@@ -65,12 +68,13 @@ def propose(
         obstacles: The swept volumes of the tick, whose rows bound the rate; None: only the robot's limits bound it.
         horizon_s: Time from the tick on for which the volumes are valid [s].
         settings: Limits; weights are not used.
+        link_speeds: (s,) largest speed of each link's ends; None: not limited [m/s].
 
     Returns:
         The step and the stop after it, along the path; or the reason why there is none.
     """
     state, slowest = PathState(*current_stop.along[0].tolist()), current_stop.rest().along[0, 1]
-    fastest, slowed = _fastest(robot, reference, state, sight, obstacles, horizon_s, settings)
+    fastest, slowed = _fastest(robot, reference, state, sight, obstacles, horizon_s, settings, link_speeds)
     if fastest is None or fastest.rate < slowest - SAME:
         return control_step.NO_SOLUTION
     stop = stop_along_path(reference.grid, fastest.s_s, fastest.rate, robot.ddq_max, settings.dt_s)
@@ -106,8 +110,9 @@ def _fastest(
     obstacles: Obstacles | None,
     horizon_s: float,
     settings: PlanSettings,
+    link_speeds: Floats | None,
 ) -> tuple[PathState | None, bool]:
-    """The largest rate that meets all constraints, and whether an approach row bounds it.
+    """The largest rate that meets all constraints, and whether an approach row or a link's speed bounds it.
 
     Every bound is linear in the next velocity, which is the rate times the path's derivative at the next position.
     """
@@ -129,6 +134,8 @@ def _fastest(
         safe = free
         if obstacles is not None and free >= 0.0:
             safe = _safe_rate(sight, obstacles, towards, free, horizon_s + settings.plan.lead_s, settings)
+        if link_speeds is not None and free >= 0.0:
+            safe = min(safe, largest_rate(pose, towards, link_speeds))
         slowed = safe < free
         return safe
 
