@@ -280,7 +280,13 @@ def _all_inside(
 
 
 def test_logs_add_up() -> None:
-    hard = {"transient_n": 50.0, "transient_limit_n": 100.0, "robot_speed": 1.0, "person_speed": None, "link": "tool"}
+    hard: dict[str, Any] = {
+        "transient_n": 50.0,
+        "transient_limit_n": 100.0,
+        "robot_speed": 1.0,
+        "person_speed": None,
+        "link": "tool",
+    }
     one = dict.fromkeys((field.name for field in FIELDS), 2.0) | {"ticks": 100, "braking_events_by_cause": {"a": 1}}
     one["worst_contact"] = hard | dict.fromkeys(NUMBERS.keys() - hard.keys())
     two = {**one, "ticks": 300, "nearest_moving_m": -1.0, "touch_speed_m_per_s": None, "deviation_mean_m": 6.0}
