@@ -38,10 +38,11 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "hrcreplay report session.mcap --cell cell.toml --set plan.task=task.toml",
         "hrcreplay report reports/session/RUN --snapshot 12.5 --out still.png",
         "hrcreplay report reports/session/RUN --figure 14",
+        "hrcreplay report reports/session/RUN --movie --out worst.mp4",
     ),
     "compare": (
         "hrcreplay compare session.mcap --cell cell.toml --out compared",
-        "hrcreplay compare monday.mcap tuesday.mcap --methods none,ssm,qp,qp:paper:fixed",
+        "hrcreplay compare monday.mcap tuesday.mcap --methods none,pfl,qp,qp:paper:fixed",
     ),
     "why": ("hrcreplay why reports/session/RUN --at 46", "hrcreplay why reports/session/RUN --at 46 --method scaling"),
     "audit": ("hrcreplay audit session.mcap --cell cell.toml",),

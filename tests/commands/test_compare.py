@@ -287,7 +287,10 @@ def test_logs_add_up() -> None:
         "person_speed": None,
         "link": "tool",
     }
-    one = dict.fromkeys((field.name for field in FIELDS), 2.0) | {"ticks": 100, "braking_events_by_cause": {"a": 1}}
+    one: dict[str, Any] = dict.fromkeys((field.name for field in FIELDS), 2.0) | {
+        "ticks": 100,
+        "braking_events_by_cause": {"a": 1},
+    }
     one["worst_contact"] = hard | dict.fromkeys(NUMBERS.keys() - hard.keys())
     two = {**one, "ticks": 300, "nearest_moving_m": -1.0, "touch_speed_m_per_s": None, "deviation_mean_m": 6.0}
     two |= {"jerk_rms_rad_per_s3": 6.0, "made_s": 1.0, "given_s": 4.0, "braking_events_by_cause": {"a": 2, "b": 5}}
