@@ -249,6 +249,13 @@ def report(
             help="With a run folder: only write its scene for the Rerun viewer (extra: rerun); --out names the file.",
         ),
     ] = False,
+    pdf: Annotated[
+        bool,
+        typer.Option(
+            "--pdf",
+            help="With a run folder: only write its safety file, four pages to print and sign; --out names the file.",
+        ),
+    ] = False,
     figure: Annotated[
         str | None,
         typer.Option(
@@ -263,8 +270,8 @@ def report(
     ] = False,
 ) -> None:
     """All stages, then metrics.json, figures, report.html with the 3-D replay, and scene.mcap."""
-    if list_figures or source is None or figure is not None or snapshot is not None or movie or rerun:
-        _part_of_report(source, figure, snapshot, out, listed=list_figures, movie=movie, rerun=rerun)
+    if list_figures or source is None or figure is not None or snapshot is not None or movie or rerun or pdf:
+        _part_of_report(source, figure, snapshot, out, listed=list_figures, movie=movie, rerun=rerun, pdf=pdf)
         return
     folder = _run(
         "report",
@@ -289,9 +296,10 @@ def _part_of_report(
     listed: bool,
     movie: bool,
     rerun: bool,
+    pdf: bool,
 ) -> None:
     """Writes single parts of a report from a run folder, without a new run folder."""
-    from hrcreplay.commands.report import draw_figures, list_figures, make_movie, save_for_rerun, take_still
+    from hrcreplay.commands.report import draw_figures, list_figures, make_movie, make_pdf, save_for_rerun, take_still
 
     if listed:
         found: list[object] = [*list_figures(source)]
@@ -303,6 +311,8 @@ def _part_of_report(
         found = [make_movie(source, out)]
     elif rerun:
         found = [save_for_rerun(source, out)]
+    elif pdf:
+        found = [make_pdf(source, out)]
     else:
         found = [take_still(source, snapshot or 0.0, out)]
     sys.stdout.write("".join(f"{line}\n" for line in found))

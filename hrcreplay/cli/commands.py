@@ -39,6 +39,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "hrcreplay report reports/session/RUN --snapshot 12.5 --out still.png",
         "hrcreplay report reports/session/RUN --figure 14",
         "hrcreplay report reports/session/RUN --movie --out worst.mp4",
+        "hrcreplay report reports/session/RUN --pdf --out safety-file.pdf",
     ),
     "compare": (
         "hrcreplay compare session.mcap --cell cell.toml --out compared",

@@ -244,7 +244,7 @@ def _compare_log(
         for variant in variants
     }
     seconds = float(ticks_ns[-1] - ticks_ns[0]) * 1e-9
-    mass = robot_mass(run_config.settings.robot, assembly.robot(run_config, programme.T_world_base)).source
+    mass = robot_mass(run_config.settings.robot, assembly.robot(run_config, programme.T_world_base)).words
     return comparison.LogResult(name, run_config.log_sha256, people.source, seconds, notes, mass, rows)
 
 

@@ -219,7 +219,7 @@ def _describe_results(
     notes = notes_of(folder, meta, told, motions, robot, run_config.settings.fusion.rate_hz)
     if robot is None:
         return {"notes": notes}
-    mass = robot_mass(run_config.settings.robot, robot).source
+    mass = robot_mass(run_config.settings.robot, robot).words
     return {"notes": notes, "robot": tables.summary(robot) | {"mass": mass}}
 
 

@@ -6,7 +6,7 @@ import json
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 from hrcreplay.commands.explain import Record, stop_table
@@ -29,10 +29,12 @@ from hrcreplay.reporting.movie import default_name, write_movie
 from hrcreplay.reporting.page import report_page
 from hrcreplay.reporting.page.replay_page import snapshot
 from hrcreplay.reporting.replay_scene import ReplayScene, replay_scene
+from hrcreplay.reporting.safety_file import log_name, safety_file
 from hrcreplay.reporting.scene_mcap import foxglove_layout, write_scene
 from hrcreplay.reporting.severity import add_severity
 from hrcreplay.reporting.summary_text import lines
 from hrcreplay.reporting.tables import PageTable
+from hrcreplay.reporting.tour import telling_moment, tour
 from hrcreplay.settings.sections import Logs, setting
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import Run, RunWriter
@@ -248,6 +250,33 @@ def save_for_rerun(folder: Path, out: Path | None) -> Path:
     run, scene = _read_scene(folder, "--rerun")
     with _new_file(path) as made:
         write_for_rerun(made, scene, run.measurements, run.folder.name)
+    return path
+
+
+def make_pdf(folder: Path, out: Path | None) -> Path:
+    """Writes the safety file of a run: four pages to print, sign and file.
+
+    Args:
+        folder: Folder of a run with a robot.
+        out: PDF to create; None: ``<log>-safety-file.pdf`` in the working directory.
+
+    Raises:
+        SettingsError: The folder is not a run folder, or the file exists or cannot be written.
+    """
+    run, scene = _read_scene(folder, "--pdf")
+    metrics = _recorded(folder, "--pdf")[1]
+    one = run.of_person(run.people[0])
+    path = out or Path(f"{PurePath(log_name(run)).stem}-safety-file.pdf")
+    stills = []
+    rows = dict.fromkeys((telling_moment(scene).row, *(int(abs(scene.seconds - s.at_s).argmin()) for s in tour(scene))))
+    with drawing.style():
+        for row in list(rows)[:2]:
+            figure = snapshot(scene, row)
+            figure.set_facecolor("white")
+            stills.append(
+                (f"The robot by {next(iter(scene.methods))} at {scene.seconds[row]:.2f} s.", drawing.png_bytes(figure))
+            )
+    run_folder.write_whole(path, safety_file(one, metrics, stills))
     return path
 
 

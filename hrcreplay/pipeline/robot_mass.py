@@ -30,6 +30,14 @@ class RobotMass(NamedTuple):
         """The effective mass M / 2 + m_L, whatever the posture; NaN: not known [kg]."""
         return 0.5 * self.moving_kg + self.payload_kg
 
+    @property
+    def words(self) -> str:
+        """The numbers and their source, for readers."""
+        if math.isnan(self.moving_kg):
+            return self.source
+        payload = f", with {self.payload_kg:g} kg of tool and workpiece" if self.payload_kg else ""
+        return f"{self.moving_kg:.3g} kg, {self.source}{payload}"
+
 
 def robot_mass(settings: Robot, model: RobotModel) -> RobotMass:
     """Returns the mass of the robot of the settings.

@@ -180,4 +180,7 @@ def _cells(one: Mapping[str, Any]) -> tuple[str, ...]:
 
 def _number(value: float | None, decimals: int) -> str:
     """Formats a number; a dash if it is not known."""
-    return "\u2013" if value is None else f"{value:,.{decimals}f}".replace(",", "\u202f").replace("-", "\u2212")
+    if value is None:
+        return "\u2013"
+    rounded = round(value, decimals) + 0.0  # without the minus of a rounded 0
+    return f"{rounded:,.{decimals}f}".replace(",", "\u202f").replace("-", "\u2212")
