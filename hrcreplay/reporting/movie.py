@@ -18,7 +18,7 @@ from hrcreplay.reporting.replay_scene import RATE_HZ, ReplayScene
 from hrcreplay.reporting.tour import TourStop, tour
 
 #: Size of the scene of one method [pixels], and of the lines of text above and below.
-_WIDE, _TALL, _BAR = 560, 480, 34
+_WIDE, _TALL, _BAR, _CAPTION = 560, 480, 34, 56
 #: Instants of the replay from one frame to the next, by the format.
 _EVERY = {".mp4": 1, ".gif": 2}
 _INK, _PAPER, _LINE = (37, 49, 60), (255, 255, 255), (223, 229, 234)
@@ -26,7 +26,7 @@ _RED, _BLUE, _ORANGE, _OBJECT, _VOLUME = (198, 40, 40), (0, 114, 178), (213, 94,
 #: Maps points of a view (n, 2) [m] to pixels.
 _Project = Callable[[Floats], list[tuple[float, float]]]
 _PATH_S = 4.0
-_MARGIN_M = 0.06
+_MARGIN_M, _PEDESTAL_M, _GREY, _FONT = 0.06, 0.12, (0.62, 0.66, 0.70), 16
 
 
 def write_movie(path: Path, scene: ReplayScene) -> None:
@@ -102,7 +102,7 @@ def frames(scene: ReplayScene, stops: Sequence[TourStop], every: int) -> Iterato
         edges = [solid.outline(view) for row in key for method in shown for solid in solids(scene, row, method)]
         low, high = _window(*bounds_of(edges, _MARGIN_M))
         for row in rows:
-            picture = Image.new("RGB", (columns * _WIDE, _TALL + 2 * _BAR), _PAPER)
+            picture = Image.new("RGB", (columns * _WIDE, _TALL + _BAR + _CAPTION), _PAPER)
             for column, method in enumerate(shown):
                 picture.paste(_scene(scene, row, method, view, low, high), (column * _WIDE, _BAR))
                 _title(picture, scene, row, method, column)
@@ -135,7 +135,7 @@ def _scene(scene: ReplayScene, row: int, method: str, view: View, low: Floats, h
             layer = Image.new("RGBA", picture.size, (0, 0, 0, 0))
             ImageDraw.Draw(layer).polygon(at(edge), fill=(*colour, opacity), outline=(*colour, 150))
             picture.alpha_composite(layer)
-    image = render_hulls(solids(scene, row, method), view, low, high, pixel_m)[:_TALL, :_WIDE]
+    image = render_hulls([*_pedestal(scene), *solids(scene, row, method)], view, low, high, pixel_m)[:_TALL, :_WIDE]
     shaded = Image.fromarray(np.ascontiguousarray(np.round(255.0 * image[::-1]).astype(np.uint8)), "RGBA")
     picture.alpha_composite(shaded, (0, _TALL - shaded.height))
     draw, track = ImageDraw.Draw(picture), scene.methods[method]
@@ -171,8 +171,27 @@ def _title(picture: Image.Image, scene: ReplayScene, row: int, method: str, colu
 
 
 def _caption(picture: Image.Image, words: str) -> None:
-    _write(picture, (10, _TALL + _BAR + 8), words, _INK)
+    """Writes what the stop shows below, in at most two lines."""
+    font, lines = ImageFont.load_default(_FONT), [""]
+    for word in words.split(" "):
+        longer = f"{lines[-1]} {word}".strip()
+        if font.getlength(longer) > picture.width - 20 and len(lines) < 2:
+            lines.append(word)
+        else:
+            lines[-1] = longer
+    for k, line in enumerate(lines):
+        _write(picture, (10, _TALL + _BAR + 6 + 22 * k), line, _INK)
+
+
+def _pedestal(scene: ReplayScene) -> list[RenderedHull]:
+    """Returns a block under a base that stands above the floor."""
+    x, y, z = scene.robot.base_m.tolist()
+    if z <= FLOOR_Z_M + 0.02:
+        return []
+    sides = [(x + dx, y + dy) for dx in (-_PEDESTAL_M, _PEDESTAL_M) for dy in (-_PEDESTAL_M, _PEDESTAL_M)]
+    corners = np.array([(*side, at) for side in sides for at in (FLOOR_Z_M, z)])
+    return [RenderedHull(corners, 0.005, _GREY)]
 
 
 def _write(picture: Image.Image, at: tuple[int, int], words: str, colour: tuple[int, int, int]) -> None:
-    ImageDraw.Draw(picture).text(at, words, fill=colour, font=ImageFont.load_default(16))
+    ImageDraw.Draw(picture).text(at, words, fill=colour, font=ImageFont.load_default(_FONT))

@@ -18,7 +18,7 @@ from hrcreplay.reporting.metrics.contact import StopEvent, method_prefixes, moti
 from hrcreplay.reporting.metrics.people import named_volumes
 from hrcreplay.reporting.metrics.planning import numeric_column
 from hrcreplay.reporting.metrics.series import seconds_from, times
-from hrcreplay.reporting.robot_description import root_of, with_capsules
+from hrcreplay.reporting.robot_description import LinkFrame, link_frames, with_capsules
 from hrcreplay.robot import irb140, irb140_shape
 from hrcreplay.robot.control.control_step import stop_axis_by_axis
 from hrcreplay.robot.control.static_obstacles import StaticHull
@@ -64,8 +64,8 @@ class RobotGeometry:
     solids: tuple[Solid, ...] = ()  #: convex parts of these meshes in the world, if they are known
     urdf: str = ""  #: text to draw it from
     joints: tuple[str, ...] = ()  #: (nv,) names of its axes there
-    root: str = ""  #: its root link there
-    T_world_root: Floats = field(default_factory=lambda: np.eye(4))  #: (4, 4) pose of that link
+    frames: tuple[LinkFrame, ...] = ()  #: its links there
+    T_world_root: Floats = field(default_factory=lambda: np.eye(4))  #: (4, 4) pose of the root of them
 
     def axes_of(self, mesh: LinkMesh) -> int:
         """Number of axes that move a mesh."""
@@ -185,7 +185,8 @@ def robot_geometry(robot: RobotModel, urdf: str | None = None) -> RobotGeometry:
     motion = robot.link_motion(zero, np.eye(robot.nv))
     moves = np.abs(motion.twist[:, :, 3:]).sum(axis=2) > 0.0  # (nv, s)
     urdf = irb140.urdf() if urdf is None else urdf
-    root, T_root_base = root_of(urdf, robot.base_frame)
+    frames = link_frames(urdf, robot.joint_names)
+    T_root_base = next((one.T_root_link for one in frames if one.name == robot.base_frame), np.eye(4))
     screws, look = motion.twist[np.arange(robot.nv), np.argmax(moves, axis=1)], own_look(robot)
     return RobotGeometry(
         links=tuple(segment.name for segment in robot.segments),
@@ -199,7 +200,7 @@ def robot_geometry(robot: RobotModel, urdf: str | None = None) -> RobotGeometry:
         solids=look,
         urdf=with_capsules(urdf, robot.segments),
         joints=robot.joint_names,
-        root=root,
+        frames=frames,
         T_world_root=robot.T_world_base @ np.linalg.inv(T_root_base),
     )
 

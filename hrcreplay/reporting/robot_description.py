@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -51,18 +52,40 @@ def _add_visual(
     ET.SubElement(ET.SubElement(visual, "geometry"), kind, size)
 
 
-def root_of(urdf: str, link: str) -> tuple[str, Floats]:
-    """Returns the root link of a URDF above one of its links, and the pose (4, 4) of that link in the root's frame [m].
+class LinkFrame(NamedTuple):
+    """Frame of a link of a URDF, with all axes at zero."""
 
-    Axes between the two count as at zero.
+    name: str
+    parent: str  #: link that it hangs on; empty for the root
+    axes: int  #: number of the robot's axes that move it
+    T_root_link: Floats  #: (4, 4) in the frame of the root
+
+
+def link_frames(urdf: str, joints: Sequence[str]) -> tuple[LinkFrame, ...]:
+    """Returns the frames of all links of a URDF, a parent before its children.
+
+    Args:
+        urdf: A URDF that pinocchio has read.
+        joints: Names of the robot's axes; other joints count as fixed at zero.
     """
     robot = ET.fromstring(urdf)  # noqa: S314  read before, with the limits of robot.urdf
     above = {_name(joint, "child"): joint for joint in robot.iter("joint") if joint.find("child") is not None}
-    T_root_link = np.eye(4)
-    while link in above:
-        joint = above.pop(link)
-        T_root_link, link = _origin(joint) @ T_root_link, _name(joint, "parent")
-    return link, T_root_link
+    frames: dict[str, LinkFrame] = {}
+
+    def add(name: str) -> LinkFrame:
+        if name not in frames:
+            joint = above.get(name)
+            if joint is None:
+                frames[name] = LinkFrame(name, "", 0, np.eye(4))
+            else:
+                parent = add(_name(joint, "parent"))
+                axes = parent.axes + (joint.get("name") in joints)
+                frames[name] = LinkFrame(name, parent.name, axes, parent.T_root_link @ _origin(joint))
+        return frames[name]
+
+    for link in robot.iter("link"):
+        add(str(link.get("name")))
+    return tuple(frames.values())
 
 
 def _name(joint: ET.Element, end: str) -> str:

@@ -40,8 +40,6 @@ _DISTANCE: Rgba = (0.48, 0.12, 0.64, 1.0)
 _BONE_M = 0.02
 #: Depth of the drawn view of a camera [m].
 _VIEW_DEPTH_M = 0.35
-#: Before the frames of the URDF's links; the layout states it, too.
-URDF_PREFIX = "urdf/"
 #: A message: topic, instant [ns], and content.
 Message = tuple[str, int, Any]
 #: Numbers of a method over time, for plots.
@@ -213,6 +211,26 @@ def _objects(scene: ReplayScene) -> Iterator[Message]:
     yield "/objects", t_ns, messages.SceneUpdate(entities=entities)
 
 
+def _link_poses(scene: ReplayScene) -> Iterator[tuple[tuple[str, str], Floats]]:
+    """Yields parent and name of each link of the URDF, and its pose in its parent: (n, 7), NaN if not known."""
+    robot, q = scene.robot, next(iter(scene.methods.values())).q
+    known = np.asarray(np.isfinite(q).all(axis=1))
+    moved = [(Rotation.identity(len(q)), np.zeros_like(q[:, :3])), *placements(robot, np.where(known[:, None], q, 0.0))]
+    poses = {}
+    for one in robot.frames:
+        (turned, at_m), T = moved[one.axes], robot.T_world_root @ one.T_root_link
+        poses[one.name] = turned * Rotation.from_matrix(T[:3, :3]), turned.apply(T[:3, 3]) + at_m
+        if one.name == WORLD:  # a link of that name stands on no frame of this scene
+            continue
+        turn, place_m = poses[one.name]
+        if one.parent and one.parent != WORLD:
+            back, origin_m = poses[one.parent]
+            turn, place_m = back.inv() * turn, back.inv().apply(place_m - origin_m)
+        rows = np.column_stack([np.round(place_m, 6), np.round(turn.as_quat(canonical=True), 6)])
+        rows[~known] = np.nan
+        yield (WORLD if one.parent in ("", WORLD) else one.parent, one.name), rows
+
+
 def _sights(scene: ReplayScene) -> Iterator[Message]:
     """Yields the cameras, as the edges of the pyramids that they see."""
     if not scene.cameras:
@@ -227,22 +245,21 @@ def _sights(scene: ReplayScene) -> Iterator[Message]:
 
 
 def _transforms(scene: ReplayScene) -> Iterator[Message]:
-    """Yields the frames of all axes of all methods and of the URDF's root, one update per instant."""
-    frames: list[str] = []
+    """Yields the frames of all axes of all methods, and of the links of the plan's URDF, one update per instant."""
+    frames: list[tuple[str, str]] = []
     numbers: list[Floats] = []
     plan = next(iter(scene.methods))
     for name, track in scene.methods.items():
         for suffix, q in (("", track.q), (" stop", track.stop_q)) if name == plan else (("", track.q),):
             known = np.asarray(np.isfinite(q).all(axis=1))
             for axis, (turned, at_m) in enumerate(placements(scene.robot, np.where(known[:, None], q, 0.0)), start=1):
-                frames.append(_frame(name, axis, suffix))
+                frames.append((WORLD, _frame(name, axis, suffix)))
                 rows = np.column_stack([np.round(at_m, 5), np.round(turned.as_quat(canonical=True), 6)])
                 rows[~known] = np.nan
                 numbers.append(rows)
-    root = scene.robot.T_world_root
-    frames.append(f"{URDF_PREFIX}{scene.robot.root}")
-    at_root = [*root[:3, 3].tolist(), *Rotation.from_matrix(root[:3, :3]).as_quat(canonical=True).tolist()]
-    numbers.append(np.round(np.tile(at_root, (len(scene.t_ns), 1)), 6))
+    for names, rows in _link_poses(scene):
+        frames.append(names)
+        numbers.append(rows)
     table = np.stack(numbers, axis=1)
     for t_ns, rows in zip(scene.t_ns.tolist(), table, strict=True):
         stamp = timestamp(t_ns)
@@ -253,12 +270,12 @@ def _transforms(scene: ReplayScene) -> Iterator[Message]:
                 transforms=[
                     messages.FrameTransform(
                         timestamp=stamp,
-                        parent_frame_id=WORLD,
-                        child_frame_id=frame,
+                        parent_frame_id=parent,
+                        child_frame_id=child,
                         translation=messages.Vector3(x=x, y=y, z=z),
                         rotation=messages.Quaternion(x=qx, y=qy, z=qz, w=qw),
                     )
-                    for frame, (x, y, z, qx, qy, qz, qw) in zip(frames, rows.tolist(), strict=True)
+                    for (parent, child), (x, y, z, qx, qy, qz, qw) in zip(frames, rows.tolist(), strict=True)
                     if x == x  # NaN: the method has no such instant
                 ]
             ),

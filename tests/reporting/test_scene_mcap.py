@@ -189,7 +189,7 @@ def test_the_layout_shows_topics_that_there_are(topics: dict[str, list[tuple[int
     assert set(shown) - {"/objects", "/cameras", "/watched"} <= topics.keys()  # these only where a cell has them
     layer = layout["configById"]["3D!scene"]["layers"]["robot"]
     assert {layer["topic"], layer["jointStatesTopic"]} <= topics.keys()
-    assert f"{layer['framePrefix']}base" in [one.child_frame_id for one in topics["/tf"][0][1].transforms]
+    assert "base" in [one.child_frame_id for one in topics["/tf"][0][1].transforms]
     paths = [path["value"] for panel in layout["configById"].values() for path in panel.get("paths", ())]
     assert len(paths) > 4
     row = topics["/plan/series"][0][1]
@@ -244,7 +244,20 @@ def test_the_urdf_is_attached_and_told_with_the_positions_of_its_joints(
     data, placed = model.createData(), shapes.createData()
     pin.updateGeometryPlacements(model, data, shapes, placed, q)
     frames = {one.child_frame_id: one for one in topics["/tf"][row][1].transforms}
-    root = frames["urdf/base"].translation
+    root, last = frames["base"].translation, ""
+    T = np.eye(4)
+    for name in ("base", *(f"link_{axis}" for axis in range(1, 7)), "flange"):  # the frames are a tree as the URDF's
+        one = frames[name]
+        assert one.parent_frame_id == ("world" if name == "base" else last)
+        step, last = np.eye(4), name
+        turn = [one.rotation.x, one.rotation.y, one.rotation.z, one.rotation.w]
+        step[:3, :3] = Rotation.from_quat(turn).as_matrix()
+        step[:3, 3] = one.translation.x, one.translation.y, one.translation.z
+        T = T @ step
+    pin.updateFramePlacements(model, data)
+    flange = data.oMf[model.getFrameId("flange")]
+    np.testing.assert_allclose(T[:3, 3], flange.translation + np.array([root.x, root.y, root.z]), atol=2e-5)
+    np.testing.assert_allclose(T[:3, :3], flange.rotation, atol=2e-5)
     balls = [k for k, one in enumerate(shapes.geometryObjects) if type(one.geometry).__name__ == "Sphere"]
     centres = np.array([placed.oMg[k].translation for k in balls]) + np.array([root.x, root.y, root.z])
     want = robot(moving_run(2.0)).ends_m(scene.methods["qp"].q[row]).reshape(-1, 3)
