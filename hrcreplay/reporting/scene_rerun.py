@@ -227,6 +227,9 @@ def _log_people(recording: Any, scene: ReplayScene) -> None:
             fields = _capsule_fields(scene.body_m[:, parts][known], radius_m[known])
             columns = rr.Capsules3D.columns(**fields, colors=np.full((known.sum(), 3), _PERSON, np.uint8))
             indexes = [_at(scene)]
+            recording.log(
+                f"{place}/body", rr.Capsules3D.from_fields(fill_mode=rr.components.FillMode.Solid), static=True
+            )
             recording.send_columns(f"{place}/body", indexes=indexes, columns=columns.partition(known.sum(axis=1)))
         for row, strips in _shown_bones(scene.points_m, pairs):
             recording.set_time(TIMELINE, duration=float(scene.seconds[row]))

@@ -63,7 +63,8 @@ def column(tables: list[Any], name: str) -> list[Any]:
 
 
 def instants_s(tables: list[Any]) -> np.ndarray:
-    return np.sort(np.concatenate([table.column(TIMELINE).cast("int64").to_numpy() for table in tables])) * 1e-9
+    moving = [table for table in tables if TIMELINE in table.schema.names]
+    return np.sort(np.concatenate([table.column(TIMELINE).cast("int64").to_numpy() for table in moving])) * 1e-9
 
 
 def test_every_entity_of_the_scene_is_there_at_its_instants(entities: dict[str, list[Any]], scene: ReplayScene) -> None:
