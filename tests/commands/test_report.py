@@ -87,6 +87,31 @@ def test_what_no_still_can_be_taken_of_is_told(tmp_path: Path) -> None:
         report.take_still(tmp_path, 1.0, None)
 
 
+def test_movie_and_rerun_file_are_made_of_the_folder_alone(sound: Run, tmp_path: Path) -> None:
+    pytest.importorskip("rerun", reason="needs rerun-sdk (extra: rerun)")
+    assert report.make_movie(sound.folder, tmp_path / "tour.gif") == tmp_path / "tour.gif"
+    assert report.save_for_rerun(sound.folder, tmp_path / "scene.rrd") == tmp_path / "scene.rrd"
+    with Image.open(tmp_path / "tour.gif") as tour:
+        assert getattr(tour, "n_frames", 1) > 20
+    assert (tmp_path / "scene.rrd").read_bytes()[:3] == b"RRF"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["scene.rrd", "tour.gif"]  # no temporary file stays
+    for make, name in ((report.make_movie, "tour.gif"), (report.save_for_rerun, "scene.rrd")):
+        with pytest.raises(SettingsError, match=f"{name}: exists already"):
+            make(sound.folder, tmp_path / name)
+    for make, option in ((report.make_movie, "--movie"), (report.save_for_rerun, "--rerun")):
+        with pytest.raises(SettingsError, match=facts(option, str(tmp_path), "hrcreplay report")):
+            make(tmp_path, None)
+
+
+def test_the_cameras_of_a_run_are_in_its_scene(sound: Run) -> None:
+    scene = report.scene_of(read_run_config(sound.folder), sound)
+    assert scene is not None
+    assert [one.name for one in scene.cameras] == ["kinect", "xtion"]
+    for one in scene.cameras:
+        np.testing.assert_array_equal(one.T_world_camera, sound.meta["cameras"][one.name])
+    assert (sound.folder / "foxglove-layout.json").is_file()
+
+
 def test_every_figure_is_drawn_again_from_the_folder_alone(sound: Run, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(sound.folder, copy, ignore=shutil.ignore_patterns("figures"))
