@@ -445,10 +445,12 @@ class Controller:
         forecast = Forecast(around, person)
         return planner.follow(forecast.t_ns, [forecast.predict(0)], around.names_of(int(person.numbers.max())))
 
-    @staticmethod
-    def to_pandas(steps: Sequence[Motion]) -> pd.DataFrame:
-        """Returns the columns of motion.parquet for some steps."""
-        return arrow_table(motion_columns(Motion.join(list(steps)))).to_pandas()
+    def to_pandas(self, steps: Sequence[Motion]) -> pd.DataFrame:
+        """Returns the columns of motion.parquet for some of its steps."""
+        motion = Motion.join(list(steps))
+        planner = None if self._started is None else self._started[0]
+        near = {} if planner is None else stages.nearest_columns(planner.robot, planner.static, motion)
+        return arrow_table(motion_columns(motion) | near).to_pandas()
 
 
 class _MemoryTables:

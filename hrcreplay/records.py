@@ -77,6 +77,26 @@ BORDER = "BORDER"
 #: Between a limb and its person in the name of a limb or volume of person 2, 3, ...
 OF_PERSON = " of person "
 
+
+def of_person(limb: str, number: int) -> str:
+    """Name of a limb of a person; that of person 1 is the limb's own."""
+    return limb if number == 1 else f"{limb}{OF_PERSON}{number}"
+
+
+def volume_name(index: int, names: Sequence[str], limbs: Sequence[str]) -> str:
+    """Name of one of the volumes that a robot keeps clear of.
+
+    Args:
+        index: Index of the volume: those of ``names``, then the limbs of persons 2, 3, ...
+        names: Names of the limbs of person 1, then of the sides of a watched area.
+        limbs: Limbs that have volumes.
+    """
+    if index < len(names):
+        return names[index]
+    person, limb = divmod(index - len(names), len(limbs))
+    return of_person(limbs[limb], person + 2)
+
+
 #: Name of the motion of the robot as recorded, among the methods; it is no controller.
 RECORDED = "recorded"
 #: Methods whose motion rests on no volume: the programme without reaction, and the robot as recorded.
@@ -251,6 +271,11 @@ class HumanStates(Table):
     def numbers(self) -> Ints:
         """(n,) number of the person of each row, from 1."""
         return np.ones(len(self), np.int64) if self.person is None else self.person
+
+    @property
+    def by_points(self) -> Bools:
+        """(n,) whether the body was only just seen and counts by the points shown alone."""
+        return np.asarray(np.isinf(self.unseen_s).all(axis=1) & np.isfinite(self.frame_age_s))
 
     def ticks(self) -> tuple[Ints, Ints]:
         """The ticks (k,), and the first row of each with the number of rows at the end (k + 1,)."""

@@ -23,6 +23,7 @@ from tests.facts import facts
 
 BEGIN_S, END_S = 8.0, 9.2
 EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
+CELL = Path(__file__).parents[1] / "datasets" / "demo_cell.toml"
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +79,17 @@ def test_tick_by_tick_is_the_whole_bit_for_bit(log: hr.Recording, people: hr.Peo
     for name, column in vars(people.states).items():
         if isinstance(column, np.ndarray):
             np.testing.assert_array_equal(getattr(together, name), column, err_msg=name)
-    pd.testing.assert_frame_equal(hr.Controller.to_pandas(steps), plan.to_pandas())
+    pd.testing.assert_frame_equal(controller.to_pandas(steps), plan.to_pandas())
+
+
+def test_steps_beside_objects_have_their_columns() -> None:
+    log = hr.open_log(hr.demo_log(), cell=CELL)
+    people = hr.fuse(log, start_s=BEGIN_S, end_s=BEGIN_S + 0.2)
+    plan, controller = hr.plan(people, baselines=()), hr.Controller(log)
+    steps = [controller.step(people.states.rows(slice(i, i + 1))) for i in range(len(people.states))]
+    table = controller.to_pandas(steps)
+    assert {"object_distance_m", "object", "object_link", "self_distance_m"} <= {*table.columns}
+    pd.testing.assert_frame_equal(table, plan.to_pandas())
 
 
 def test_a_data_frame_is_a_log(log: hr.Recording, people: hr.People) -> None:

@@ -440,7 +440,9 @@ def plan(task: VariantTask, progress: Callable[[int], None] | None = None) -> tu
             t_ns, most = forecast.t_ns, max(most, int(batch.numbers.max()))
             around = [forecast.predict(tick) for tick in range(len(t_ns))]
             made = planner.follow(t_ns, around, surroundings.names_of(most))
-            writer.table(f"motion_{slug}", motion_columns(made) | stages.nearest_columns(planner, made))
+            writer.table(
+                f"motion_{slug}", motion_columns(made) | stages.nearest_columns(planner.robot, planner.static, made)
+            )
         count = len(batch.ticks()[0])
         done += count
         if progress is not None:

@@ -22,7 +22,7 @@ from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.pipeline import assembly
 from hrcreplay.pipeline.assembly import Forecast
 from hrcreplay.pipeline.run_config import RunConfig, resolve
-from hrcreplay.records import ALLOWING_CONTACT, LIMBS, RECORDED, STATUSES, Floats, HumanStates, Ints
+from hrcreplay.records import ALLOWING_CONTACT, LIMBS, RECORDED, STATUSES, Floats, HumanStates, Ints, of_person
 from hrcreplay.reporting.metrics.planning import stationary
 from hrcreplay.reporting.metrics.series import true_runs
 from hrcreplay.reporting.tables import PageTable, neighbour_text, reason_text
@@ -371,7 +371,7 @@ def _unseen(people: HumanStates, name: str) -> float | None:
     for row, number in enumerate(people.numbers.tolist()):
         for k, limb in enumerate(LIMBS):
             since = people.unseen_s[row, k]
-            if name == assembly.of_person(limb, number) and np.isfinite(since):
+            if name == of_person(limb, number) and np.isfinite(since):
                 return float(since)
     return None
 

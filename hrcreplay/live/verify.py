@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -36,7 +36,7 @@ from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import Decision, Perception, Signal, TickEvent
 from hrcreplay.live.record.recorder import SessionLogReader
 from hrcreplay.pipeline.run_config import versions
-from hrcreplay.records import STATUSES, SweptVolumes
+from hrcreplay.records import STATUSES, SweptVolumes, of_person
 from hrcreplay.store import run_folder
 from hrcreplay.store.columns import state_columns
 from hrcreplay.store.machine import describe_machine, name_machine
@@ -192,7 +192,7 @@ class DecisionMaker(Protocol):
     """Source of a session's decisions: ``SessionController``, or a substitute in tests."""
 
     def update_perception(self, t_ns: int, skeletons: Sequence[bytes]) -> Perception | None:
-        """Perception of the person."""
+        """Perception of the people."""
 
     def answer(self, event: TickEvent) -> Decision:
         """Decision for the robot."""
@@ -360,29 +360,36 @@ class SessionRecomputation:
         self.looks += 1
         if perception is None:
             return [differing("look", "done", "failed")]
-        if codec.encode_perception(perception.states, perception.volumes, len(frames)) == message:
+        if codec.encode_perception(perception, len(frames)) == message:
             return []
-        columns = state_columns(perception.states)
-        cameras = [f"valid_{camera}" for camera in perception.states.cameras]
+        states = perception.states
+        if (again := states.numbers.tolist()) != (people := recorded.people.tolist()):
+            return [differing("people", people, again)]
+        columns = state_columns(replace(states, person=None))
+        cameras = [f"valid_{camera}" for camera in states.cameras]
         names = [name for name in columns if name != "t_ns" and name not in cameras]
-        self._suspects = _digests_differing(recorded.digests, perception.volumes)
-        return [
-            *numbers_differing(names, recorded.state, codec.state_numbers(perception.states)),
-            *decisions_differing(cameras, list(recorded.valid), list(perception.states.valid[0].tobytes())),
-        ]
+        self._suspects = _digests_differing(recorded.digests, perception)
+        numbers, found = codec.state_numbers(states), list[Difference]()
+        for row, number in enumerate(people):
+            ones = numbers_differing(names, recorded.state[row], numbers[row])
+            ones += decisions_differing(cameras, recorded.valid[row].tolist(), states.valid[row].tolist())
+            found += [one.at("" if number == 1 else f"person {number}: ") for one in ones]
+        return found
 
     def _volumes(self, message: bytes) -> list[Difference]:
         suspects, self._suspects = self._suspects, []
         if self._perception is None:
             return [differing("volumes", "some", "none")]
-        volumes, horizon_s = self._perception.volumes, self._perception.horizon_s
-        recorded, held_s = codec.decode_volumes(message, volumes.limbs, volumes.method)
+        look = self._perception
+        recorded = codec.decode_volumes(message, look.volumes.limbs, look.volumes.method)
+        if (again := look.states.numbers.tolist()) != (people := recorded.people.tolist()):
+            return [differing("people of the volumes", people, again)]
         found = [
-            *numbers_differing(["horizon_s"], np.array([held_s]), np.array([horizon_s])),
-            *_volumes_differing(recorded, volumes),
+            *numbers_differing(["horizon_s"], np.array([recorded.horizon_s]), np.array([look.horizon_s])),
+            *_volumes_differing(recorded, look.volumes),
         ]
         # the digests of the recorded volumes must give the same differences as the recorded digests
-        digests = _digests_differing(codec.volume_digests(recorded), volumes) if suspects else []
+        digests = _digests_differing(codec.volume_digests(recorded.volumes), look) if suspects else []
         return found if [one.text for one in digests] == [one.text for one in suspects] else [*found, *suspects]
 
     def _answer(self, message: bytes) -> list[Difference]:
@@ -420,28 +427,30 @@ def _decision(found: codec.RecordedDecision) -> list[Any]:
     ]
 
 
-def _digests_differing(recorded: tuple[bytes, ...], volumes: SweptVolumes) -> list[Difference]:
+def _of_all(names: Sequence[str], people: Sequence[int]) -> list[str]:
+    """The names for every person, person after person."""
+    return [of_person(name, number) for number in people for name in names]
+
+
+def _digests_differing(recorded: tuple[bytes, ...], look: Perception) -> list[Difference]:
     """Limbs whose volume has another digest; tolerable if its numbers are equal on a grid."""
-    again = codec.volume_digests(volumes)
-    names = [f"volume of {limb} (digest)" for limb in volumes.limbs]
+    again = codec.volume_digests(look.volumes)
+    names = [f"volume of {limb} (digest)" for limb in _of_all(look.volumes.limbs, look.states.numbers.tolist())]
     found = decisions_differing(names, [one.hex() for one in recorded], [one.hex() for one in again])
-    grid = {
-        f"volume of {limb} (digest)"
-        for limb, one, other in zip(volumes.limbs, recorded, again, strict=False)
-        if codec.same_on_a_grid(one, other)
-    }
+    grid = {name for name, one, other in zip(names, recorded, again, strict=False) if codec.same_on_a_grid(one, other)}
     return [Difference(one.text, 0.0) if one.text.partition(":")[0] in grid else one for one in found]
 
 
-def _volumes_differing(recorded: SweptVolumes, again: SweptVolumes) -> list[Difference]:
+def _volumes_differing(recorded: codec.RecordedVolumes, again: SweptVolumes) -> list[Difference]:
     """The numbers that differ in the volumes of a perception update."""
     found: list[Difference] = []
-    for limb, name in enumerate(again.limbs):
-        mine, yours = recorded.vertices(0, limb), again.vertices(0, limb)
+    for one, name in enumerate(_of_all(again.limbs, recorded.people.tolist())):
+        row, limb = divmod(one, len(again.limbs))
+        mine, yours = recorded.volumes.vertices(row, limb), again.vertices(row, limb)
         if len(mine) != len(yours):
             return [*found, differing(f"vertices of {name}", len(mine), len(yours))]
         names = [f"vertex {i} of {name}, {axis}" for i in range(len(mine)) for axis in "xyz"]
-        radii = (volumes.radius_m[0, limb : limb + 1] for volumes in (recorded, again))
+        radii = (volumes.radius_m[row, limb : limb + 1] for volumes in (recorded.volumes, again))
         found += numbers_differing(names, mine.ravel(), yours.ravel())
         found += numbers_differing([f"radius of {name}"], *radii)
     return found

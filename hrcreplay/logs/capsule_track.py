@@ -17,8 +17,11 @@ from hrcreplay.logs.messages import Undecodable, stamp_ns, topic_list
 from hrcreplay.records import Floats, Ints
 from hrcreplay.settings.sections import Logs, RobotCapsules
 
-#: Message types of capsules that need no setting.
-TYPES = ("reachable_occupancy/ReachableOccupancy",)
+#: Message types of capsules that need no setting, with what differs from the defaults of ``logs.robot_capsules``.
+_TYPES: dict[str, dict[str, Any]] = {
+    "reachable_occupancy/ReachableOccupancy": {},
+    "hrcreplay.RobotCapsules": {"capsules": "capsules", "stamp": None},
+}
 #: Numbers of a capsule, in the order of ``CapsuleTrack.numbers``.
 PARTS = (*(f"{end}_{axis}" for end in ("start", "end") for axis in "xyz"), "radius")
 
@@ -45,7 +48,7 @@ def find_capsules(source: LogFiles, given: RobotCapsules | None) -> RobotCapsule
                 f"{source.path}: logs.robot_capsules: no topic {given.topic}; found {topic_list(source.topics())}"
             )
         return given
-    return next((RobotCapsules(topic=name) for name, kind in found.items() if kind in TYPES), None)
+    return next((RobotCapsules(topic=name, **_TYPES[kind]) for name, kind in found.items() if kind in _TYPES), None)
 
 
 def read_capsules(source: LogFiles, how: RobotCapsules, defects: Counter[str]) -> CapsuleTrack | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -15,8 +16,8 @@ from hrcreplay.records import Floats
 
 _CHICO_HZ = 25.0
 _ROBOT = (
-    "the robot's {count} points are not taken: they are places, which do not tell the angles of its axes; give the "
-    "robot by its own log, or a task"
+    "the robot's {count} points are not taken: they are places on body and legs, which tell neither the angles of its "
+    "axes nor its shape; give the robot by its own log, or a task"
 )
 
 
@@ -59,9 +60,9 @@ def read_chico(path: Path, mapping: ImportMapping) -> Tracks:
     if not isinstance(frames, list) or not frames or not all(_is_pair(frame) for frame in frames):
         raise LogError(f"{path}: found {type(frames).__name__}; would be right: a list of person and robot per frame")
     points = np.stack([_points(frame[0], 15, f"{path}: frame {i + 1}") for i, frame in enumerate(frames)])
-    robot = _points(frames[0][1], 9, f"{path}: frame 1: robot")
+    arm = np.stack([_points(frame[1], 9, f"{path}: frame {i + 1}: robot") for i, frame in enumerate(frames)])
     t_ns = times_at(len(points), rate_of(mapping, _CHICO_HZ, str(path)))
-    return _with_robot(one_body(t_ns, tuple(map(str, range(15))), points, str(path), None), robot)
+    return replace(one_body(t_ns, tuple(map(str, range(15))), points, str(path), None), arm=arm)
 
 
 def _is_pair(frame: Any) -> bool:
@@ -83,7 +84,8 @@ def read_harper(path: Path, mapping: ImportMapping) -> Tracks:
     steps = np.append(0, at[1:] - at[:-1])
     step = max(1, int(np.median(steps[1:]))) if len(steps) > 1 else 1  # a gap in the numbers is a gap in time
     t_ns = np.round(np.cumsum(steps) / step / rate_hz * 1e9).astype(np.int64)
-    return _with_robot(one_body(t_ns, tuple(map(str, range(21))), points, str(path), None), robot)
+    note = _ROBOT.format(count=len(robot))
+    return replace(one_body(t_ns, tuple(map(str, range(21))), points, str(path), None), notes=(note,))
 
 
 def _is_frame(number: Any, frame: Any, keys: tuple[str, ...]) -> bool:
@@ -98,8 +100,3 @@ def _points(values: Any, count: int, where: str) -> Floats:
     if points.shape != (count, 3):
         raise LogError(f"{where}: found {points.shape} numbers; would be right: {count} points of three numbers")
     return points
-
-
-def _with_robot(tracks: Tracks, robot: Floats) -> Tracks:
-    note = _ROBOT.format(count=len(robot))
-    return Tracks(tracks.t_ns, tracks.body, tracks.names, tracks.points, tracks.confidence, tracks.unit, (note,))

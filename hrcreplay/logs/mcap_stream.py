@@ -25,6 +25,7 @@ from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 from hrcreplay.errors import LogError
 from hrcreplay.logs import ros_bags
 from hrcreplay.logs import skeleton_pb2 as pb
+from hrcreplay.logs.capsules_pb2 import RobotCapsules
 from hrcreplay.logs.messages import (
     MCAP_MAGIC,
     Damage,
@@ -39,7 +40,8 @@ from hrcreplay.logs.unpack import CHUNK_BYTES, CHUNK_RECORDS, KNOWN, METHODS, Ca
 
 _RUN_BYTES = 1 << 20
 _OURS = {
-    kind.DESCRIPTOR.full_name: kind for kind in (pb.Skeleton, pb.Camera, pb.Task, pb.Base, pb.Truth, pb.JointState)
+    kind.DESCRIPTOR.full_name: kind
+    for kind in (pb.Skeleton, pb.Camera, pb.Task, pb.Base, pb.Truth, pb.JointState, RobotCapsules)
 }
 _BROKEN = (McapError, CRCValidationError, struct.error, RuntimeError, ValueError)
 

@@ -124,6 +124,7 @@ PROFILE = "hrcreplay"  #: profile in the MCAP header of hrcreplay's own logs
 TASK = "/task"
 BASE = "/robot/base"
 JOINTS = "/robot/joints"
+CAPSULES = "/robot/capsules"
 TRUTH = "/truth"
 
 

@@ -18,7 +18,7 @@ from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.logs import presets
 from hrcreplay.logs.messages import METRES
 from hrcreplay.logs.plausibility import PERSON_M, PROPORTION, bone_ratio, statures
-from hrcreplay.logs.writer import ARRIVAL_NOTE, START_NS, ImportedSkeleton, overlap_notes, write_log
+from hrcreplay.logs.writer import ARRIVAL_NOTE, START_NS, Capsules, ImportedSkeleton, overlap_notes, write_log
 from hrcreplay.records import NOBODY, POINTS, Floats, Ints
 from hrcreplay.settings.sections import Axis, Finite, Positive, Section, is_rotation
 
@@ -26,6 +26,10 @@ from hrcreplay.settings.sections import Axis, Finite, Positive, Section, is_rota
 TIME_UNITS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 _SKIN = "plug_in_gait"
 _SKIN_CONFIDENCE = 0.5  # markers on the skin, as for the optical targets of KERAAL
+_NO_ARM = (
+    "the robot's {count} points are not taken: they are places along its arm and do not tell the angles of its axes; "
+    "would be right: the radius of its links as robot_radius_m in --mapping, or the robot by its own log, or a task"
+)
 _FAR = 1e9  # in any unit, no coordinate of a person
 _LATEST_NS = 9e18  # near the end of int64
 _FEW = 10  # with fewer frames, proportions are not judged
@@ -67,6 +71,9 @@ class ImportMapping(Section):
     """As in logs.decoders."""
     offset_m: tuple[Finite, Finite, Finite] | None = None
     """Place of the points' origin in the log, added to all points: for points relative to the hips [m]."""
+    robot_radius_m: Positive | None = None
+    """Radius of the capsules between the points of the robot's arm, in sets that have them; none: the robot is left
+    out [m]."""
     skip: Annotated[int, Field(ge=0)] = 0
     """Lines of a CSV file before the header."""
 
@@ -91,6 +98,7 @@ class Tracks:
     unit: str | None = None  #: of the points; None: not known from the file
     notes: tuple[str, ...] = ()
     order: str | None = None  #: order of its points; None: that of the format
+    arm: Floats | None = None  #: (n, r, 3) points along the robot's arm in the same frame and unit; None: not known
 
 
 @dataclass(frozen=True)
@@ -125,12 +133,25 @@ def import_motion(form: Format, paths: Mapping[str, Path], out: Path, mapping: I
         notes.append(
             f"the times begin at {first_ns * 1e-9:g} s; {shift_ns * 1e-9:g} s are added, because 0 means no time"
         )
-    bodies = {}
+    bodies, robot = {}, None
     for camera, track in tracks.items():
-        points, confidence, told = body_points(track, form, mapping, f"{paths[camera]}")
+        points, confidence, unit, told = body_points(track, form, mapping, f"{paths[camera]}")
         notes.extend(f"camera {camera}: {note}" for note in (*track.notes, *told))
         bodies[camera] = _rows(track, points, confidence, shift_ns)
-    return [*notes, *overlap_notes(write_log(bodies, out))]
+        if robot is None and track.arm is not None and mapping.robot_radius_m is not None:
+            robot = _capsules(_in_metres(track.arm, unit, mapping), track.t_ns + shift_ns, mapping.robot_radius_m)
+            notes.append(
+                f"the robot's arm is taken as {robot.ends_m.shape[1]} capsules of robot_radius_m, in the frame of "
+                f"camera {camera}: give that camera's pose as T_world_base, too, in the cell file"
+            )
+        elif track.arm is not None:
+            notes.append(_NO_ARM.format(count=track.arm.shape[1]))
+    return [*notes, *overlap_notes(write_log(bodies, out, robot))]
+
+
+def _capsules(arm_m: Floats, t_ns: Ints, radius_m: float) -> Capsules:
+    """Returns the capsules between neighbouring points of an arm (n, r, 3) [m]."""
+    return Capsules(t_ns, np.stack([arm_m[:, :-1], arm_m[:, 1:]], axis=2), radius_m)
 
 
 def _rows(track: Tracks, points: Floats, confidence: Floats, shift_ns: int) -> Iterator[ImportedSkeleton]:
@@ -138,8 +159,10 @@ def _rows(track: Tracks, points: Floats, confidence: Floats, shift_ns: int) -> I
         yield ImportedSkeleton(t_ns + shift_ns, body, points[i], confidence[i])
 
 
-def body_points(track: Tracks, form: Format, mapping: ImportMapping, where: str) -> tuple[Floats, Floats, list[str]]:
-    """Returns points (n, 20, 3) [m] and confidence (n, 20) of a file's bodies, and remarks.
+def body_points(
+    track: Tracks, form: Format, mapping: ImportMapping, where: str
+) -> tuple[Floats, Floats, str, list[str]]:
+    """Returns points (n, 20, 3) [m] and confidence (n, 20) of a file's bodies, the file's unit, and remarks.
 
     Args:
         track: Points of the file.
@@ -165,16 +188,14 @@ def body_points(track: Tracks, form: Format, mapping: ImportMapping, where: str)
     if unit is None:
         unit = _unit_by_size(found, where)
         notes.append(f"the unit is taken as {unit}, in which the body has the size of a person")
-    found = METRES[unit] * _turned(found, mapping.axes)
+    found = _in_metres(found, unit, mapping)
     ratio = bone_ratio(found) if len(found) >= _FEW else 1.0
     if ratio > PROPORTION:
         raise LogError(
             f"{where}: the body is {ratio:.1f} times as tall by one bone as by another, so its points are in another "
             "order than this format's; would be right: which point is which body part, with index in --mapping"
         )
-    if mapping.offset_m is not None:
-        found = found + np.array(mapping.offset_m)
-    elif _about_hips(found):
+    if mapping.offset_m is None and _about_hips(found):
         raise LogError(
             f"{where}: the middle of the hips is always at the origin, so the file does not tell where the person "
             "is; would be right: points in a camera or room, or their place with offset_m in --mapping"
@@ -182,7 +203,13 @@ def body_points(track: Tracks, form: Format, mapping: ImportMapping, where: str)
     missing = presets.lacking({point for i, point in enumerate(POINTS) if np.isfinite(found[:, i]).any()})
     if missing:
         notes.append(f"the points lack {missing}")
-    return found, confidence, notes
+    return found, confidence, unit, notes
+
+
+def _in_metres(points: Floats, unit: str, mapping: ImportMapping) -> Floats:
+    """Points (..., 3) of a file in metres, by the axes and the place that the mapping gives."""
+    found = METRES[unit] * _turned(points, mapping.axes)
+    return found if mapping.offset_m is None else found + np.array(mapping.offset_m)
 
 
 def _order(track: Tracks, form: Format, mapping: ImportMapping, where: str) -> tuple[str, presets.Places]:

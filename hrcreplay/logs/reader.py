@@ -46,6 +46,7 @@ _BODIES = "body_tracking"  # in the name of a topic: it carries bodies, even wit
 _NO_BODIES = (
     "sensor_msgs/JointState",
     "hrcreplay.JointState",
+    "hrcreplay.RobotCapsules",
     "hrcreplay.Truth",
     "hrcreplay.Task",
     "rcl_interfaces/Log",

@@ -26,9 +26,24 @@ from mcap.writer import CompressionType, Writer
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.logs import messages
 from hrcreplay.logs import skeleton_pb2 as pb
+from hrcreplay.logs.capsules_pb2 import Capsule, Point, RobotCapsules
 from hrcreplay.records import POINTS, CameraFrames, Floats, Ints
 
 _CHUNK_BYTES = 256 * 1024  # about ten seconds of two cameras: small enough for seeking, large enough for compression
+
+
+class Capsules(NamedTuple):
+    """Capsules of a recorded robot's links."""
+
+    t_ns: Ints  #: (n,) instants
+    ends_m: Floats  #: (n, s, 2, 3) both ends of their axes, in the frame of the base [m]
+    radius_m: float  #: of all of them [m]
+
+
+def _named_axes(ends: list[list[list[float]]]) -> Iterator[list[dict[str, float]]]:
+    """Both ends of each capsule, by the names of the axes."""
+    for both in ends:
+        yield [dict(zip("xyz", end, strict=True)) for end in both]
 
 
 class LogWriter:
@@ -130,6 +145,12 @@ class LogWriter:
         """Adds the robot's joints: (n,) instants and (n, nv) positions [rad]."""
         for t, row in zip(t_ns.tolist(), q.tolist(), strict=True):
             self._write(messages.JOINTS, pb.JointState(t_ns=t, names=names, q=row), t, t)
+
+    def capsules(self, capsules: Capsules) -> None:
+        """Adds the capsules of the robot's links, in the frame of its base."""
+        for t, ends in zip(capsules.t_ns.tolist(), capsules.ends_m.tolist(), strict=True):
+            row = [Capsule(p1=Point(**a), p2=Point(**b), r=capsules.radius_m) for a, b in _named_axes(ends)]
+            self._write(messages.CAPSULES, RobotCapsules(t_ns=t, capsules=row), t, t)
 
     def _latch(self, topic: str, message: Any) -> None:
         self._latched.append((topic, message))
@@ -343,8 +364,15 @@ def skeleton_row(
     return ImportedSkeleton(t_ns, body, points, trust)
 
 
-def write_log(sources: Mapping[str, Iterator[ImportedSkeleton]], out: Path) -> dict[str, tuple[int, int]]:
+def write_log(
+    sources: Mapping[str, Iterator[ImportedSkeleton]], out: Path, robot: Capsules | None = None
+) -> dict[str, tuple[int, int]]:
     """Writes the rows of all cameras, merged by time, as a log; no file is left if a source fails.
+
+    Args:
+        sources: Camera -> its rows.
+        out: Log to write.
+        robot: Robot that was recorded, too.
 
     Returns:
         Camera -> first and last time [ns].
@@ -368,6 +396,8 @@ def write_log(sources: Mapping[str, Iterator[ImportedSkeleton]], out: Path) -> d
         empty = [name for name in cameras if name not in spans]
         if empty:
             raise LogError(f"camera {empty[0]}: no row with a body; would be right: one row a body a frame")
+        if robot is not None:
+            log.capsules(robot)
     return spans
 
 

@@ -32,7 +32,6 @@ from hrcreplay.records import (
     ALLOWING_CONTACT,
     BORDER,
     NOBODY,
-    OF_PERSON,
     RECORDED,
     UNGUARDED,
     AxisFrame,
@@ -43,6 +42,7 @@ from hrcreplay.records import (
     Ints,
     Measurements,
     SweptVolumes,
+    volume_name,
 )
 from hrcreplay.robot.control.border import Border
 from hrcreplay.robot.control.control_step import PlanSettings
@@ -218,8 +218,8 @@ class Surroundings:
 
     def names_of(self, people: int) -> tuple[str, ...]:
         """Names of all obstacles beside so many people: ``names``, then the limbs of persons 2, 3, ..."""
-        limbs = self.prediction.limbs
-        return (*self.names, *(of_person(limb, k) for k in range(2, people + 1) for limb in limbs))
+        names, limbs = self.names, self.prediction.limbs
+        return tuple(volume_name(i, names, limbs) for i in range(len(names) + (people - 1) * len(limbs)))
 
     def obstacles(self, states: HumanStates, people: Sequence[Obstacles]) -> Obstacles:
         """Returns the volumes of a tick and the border, as far as they are known.
@@ -248,11 +248,6 @@ class Surroundings:
         limbs = (first[:, None] + np.arange(each)).ravel()
         rest = each + np.arange(len(found.radius_m) - len(limbs))
         return replace(found, numbers=np.concatenate([limbs, rest]))
-
-
-def of_person(limb: str, number: int) -> str:
-    """Name of a limb of a person; that of person 1 is the limb's own."""
-    return limb if number == 1 else f"{limb}{OF_PERSON}{number}"
 
 
 @dataclass
@@ -341,7 +336,7 @@ def fusion_stage(run_config: RunConfig, log: LogLike) -> FusionStage:
         person_jump_m=logs.person_jump_m,
         person_memory_s=logs.person_memory_s,
         watched=watched_area(run_config),
-        people="nearest" if run_config.command == "live" else logs.people,
+        people=logs.people,
     )
 
 

@@ -39,7 +39,8 @@ from hrcreplay.records import (
     SkeletonTrack,
     SweptVolumes,
 )
-from hrcreplay.robot.control.static_obstacles import nearest
+from hrcreplay.robot.control.static_obstacles import StaticObstacles, nearest
+from hrcreplay.robot.model import RobotModel
 from hrcreplay.settings.sections import Fusion
 from hrcreplay.store.columns import (
     measurement_columns,
@@ -291,14 +292,16 @@ class PeopleChecks:
 
     def write(self, sink: Sink) -> None:
         """Writes the checks and notes."""
-        people = {number: Measurements.join(parts) for number, parts in self._parts.items()}
-        most = max(people, key=lambda number: len(people[number]), default=None)
+        frames = {number: sum(map(len, parts)) for number, parts in self._parts.items()}
+        most = max(frames, key=lambda number: frames[number], default=None)
         write_checks(CameraChecks(self._cameras) if most is None else self._checks[most], sink)
-        if len(people) > 1:
-            sink.notes["fuse"].extend(self._describe(people))
+        sink.notes["fuse"].extend(self.describe())
 
-    def _describe(self, people: Mapping[int, Measurements]) -> Iterator[str]:
-        """Returns the note on several people, and one for each that may be a thing."""
+    def describe(self) -> Iterator[str]:
+        """Returns the note on several people, and one for each that may be a thing; none for one person."""
+        people = {number: Measurements.join(parts) for number, parts in self._parts.items()}
+        if len(people) < 2:
+            return
         start_ns = min(int(seen.capture_ns.min()) for seen in people.values())
         spans = {
             number: ((int(seen.capture_ns.min()) - start_ns) / NS, (int(seen.capture_ns.max()) - start_ns) / NS)
@@ -531,7 +534,7 @@ def plan_batches(
         for name, planner in planners.items():
             with sink.watch.stage(f"plan {name}", len(t_ns)):
                 motion = planner.follow(t_ns, around, surroundings.names_of(most))
-            columns = motion_columns(motion) | nearest_columns(planner, motion)
+            columns = motion_columns(motion) | nearest_columns(planner.robot, planner.static, motion)
             sink.tables.table("motion" if planner.chosen else f"motion_{name}", columns)
             if planner.chosen:
                 stored = select_stored_ticks(done, len(t_ns), store_every)
@@ -547,12 +550,11 @@ def plan_batches(
         yield
 
 
-def nearest_columns(planner: Follower, motion: Motion) -> dict[str, Any]:
+def nearest_columns(robot: RobotModel, static: StaticObstacles | None, motion: Motion) -> dict[str, Any]:
     """Returns the columns of the nearest objects and links; none if the cell has no objects."""
-    static = planner.static
     if static is None:
         return {}
-    found = nearest(planner.robot, static, motion.q)
+    found = nearest(robot, static, motion.q)
     return static_columns(
         object_m=found.object_m,
         nearest_object=(found.object, static.names),

@@ -11,8 +11,7 @@ import pandas as pd
 from scipy.spatial.transform import Rotation
 
 from hrcreplay.human.model import skeleton
-from hrcreplay.pipeline.assembly import of_person
-from hrcreplay.records import JOINTS, LENGTHS, POINTS, RECORDED, Bools, Floats, Ints
+from hrcreplay.records import JOINTS, LENGTHS, POINTS, RECORDED, Bools, Floats, Ints, of_person
 from hrcreplay.reporting.figures.drawing import BONES
 from hrcreplay.reporting.metrics.contact import StopEvent, method_prefixes, motion_of, stop_events
 from hrcreplay.reporting.metrics.people import named_volumes

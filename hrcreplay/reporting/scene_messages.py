@@ -49,17 +49,23 @@ def timestamp(t_ns: int) -> Any:
     return messages.Timestamp(t_ns // _NS, t_ns % _NS)
 
 
-def entity(t_ns: int, name: str, *, frame: str = WORLD, **shapes: Any) -> Any:
+def entity(t_ns: int, name: str, *, frame: str = WORLD, lasts_s: float = 0.0, **shapes: Any) -> Any:
     """Makes an entity of a scene, valid until its next update.
 
     Args:
         t_ns: Instant [ns].
         name: Name of the entity.
         frame: Frame of its shapes, with which it moves.
+        lasts_s: Time after which it is gone without an update; 0: it stays [s].
         **shapes: Lists of primitives.
     """
     return messages.SceneEntity(
-        timestamp=timestamp(t_ns), frame_id=frame, id=name, frame_locked=frame != WORLD, **shapes
+        timestamp=timestamp(t_ns),
+        frame_id=frame,
+        id=name,
+        lifetime=messages.Duration(*divmod(round(lasts_s * _NS), _NS)) if lasts_s else None,
+        frame_locked=frame != WORLD,
+        **shapes,
     )
 
 

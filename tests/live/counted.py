@@ -99,9 +99,11 @@ class Person:
         """What is due."""
         yield b"H"
         while self._framed_ns <= self._clock.t_ns:
-            place = far_away(0.0)
+            other = self._flight.second((self._framed_ns - BEGIN_NS) * 1e-9)
             for camera in self._flight.start["cameras"]:
-                yield b"F" + self._flight._skeleton(camera, place, self._framed_ns)
+                if other is not None:
+                    yield b"f" + self._flight._skeleton(camera, other, self._framed_ns, 2)
+                yield b"F" + self._flight._skeleton(camera, far_away(0.0), self._framed_ns)
             self._framed_ns += FRAME_NS
 
 

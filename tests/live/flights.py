@@ -67,6 +67,7 @@ class Flight:
     frames: list[tuple[int, bytes]] = field(default_factory=list)
     cell: Path | None = None  #: cell file; where it says what is watched, frames show that nobody is there
     silent: Callable[[float], bool] = lambda _s: False  #: whether no camera sends anything
+    second: Walk = lambda _s: None  #: another person whom every camera shows, too
     named: Callable[[float], bool] = lambda _s: False  #: whether they name another body, and show no point of it
 
     def __post_init__(self) -> None:
@@ -110,30 +111,34 @@ class Flight:
     def _update_perception(self, t_ns: int) -> None:
         seen = []
         while self._framed_ns <= t_ns:
-            place = self.walk((self._framed_ns - BEGIN_NS) * 1e-9)
-            if self.silent((self._framed_ns - BEGIN_NS) * 1e-9):
-                pass
-            elif place is None and self._watched:
-                seen += [_without_points(camera, NOBODY, self._framed_ns) for camera in self.start["cameras"]]
-            elif place is not None:
-                seen += [self._skeleton(camera, place, self._framed_ns) for camera in self.start["cameras"]]
-            if self.named((self._framed_ns - BEGIN_NS) * 1e-9):
-                seen += [_without_points(camera, 2, self._framed_ns) for camera in self.start["cameras"]]
+            seen += self._frames(self._framed_ns)
             self._framed_ns += FRAME_NS
         perception = self.controller.update_perception(t_ns, seen)
         self.frames += [(t_ns, data) for data in seen]
         self.messages += [codec.encode_skeleton(t_ns, data) for data in seen]
         if perception is not None:
             self.states.append(perception.states)
-            self.messages.append(codec.encode_perception(perception.states, perception.volumes, len(seen)))
+            self.messages.append(codec.encode_perception(perception, len(seen)))
 
-    def _skeleton(self, camera: str, place_m: tuple[float, float], t_ns: int) -> bytes:
+    def _frames(self, t_ns: int) -> list[bytes]:
+        t_s = (t_ns - BEGIN_NS) * 1e-9
+        there = [(body, walk(t_s)) for body, walk in ((1, self.walk), (2, self.second))]
+        shown = [] if self.silent(t_s) else [(body, place_m) for body, place_m in there if place_m is not None]
+        cameras = self.start["cameras"]
+        found = [self._skeleton(camera, place_m, t_ns, body) for body, place_m in shown for camera in cameras]
+        if not shown and self._watched and not self.silent(t_s):
+            found += [_without_points(camera, NOBODY, t_ns) for camera in cameras]
+        if self.named(t_s):
+            found += [_without_points(camera, 2, t_ns) for camera in cameras]
+        return found
+
+    def _skeleton(self, camera: str, place_m: tuple[float, float], t_ns: int, body: int = 1) -> bytes:
         base = np.array(self.start["T_world_base"])[:3, 3]
         bend = 0.1 + 0.02 * np.sin(np.pi * 1e-9 * (t_ns - BEGIN_NS))  # nobody stands like a frozen picture
         joints = np.array([[base[0] + place_m[0], base[1] + place_m[1], np.pi, bend, *(0.1, 0.5, 0.0, 1.8) * 2, 0.94]])
         to_camera = np.linalg.inv(np.array(self.start["cameras"][camera]))
         points = skeleton(joints, LENGTHS_M)[0] @ to_camera[:3, :3].T + to_camera[:3, 3]
-        message = skeleton_pb2.Skeleton(capture_ns=t_ns, camera=camera, body=1)
+        message = skeleton_pb2.Skeleton(capture_ns=t_ns, camera=camera, body=body)
         message.points.extend(points.ravel().tolist())
         message.confidence.extend(np.isfinite(points[:, 0]).astype(float).tolist())
         data: bytes = message.SerializeToString()

@@ -59,7 +59,7 @@ class MadeController:
         vertices = np.arange(6 * 4 * 3).reshape(-1, 3) + np.tanh(self.p[0])
         offsets = np.arange(0, 4 * len(LIMBS) + 1, 4)
         volumes = SweptVolumes(np.array([t_ns]), offsets, vertices, np.full((1, 6), 0.1), LIMBS, "positions")
-        return Perception(t_ns, states, volumes, obstacles(volumes, 0), 0.1)
+        return Perception(t_ns, states, volumes, (obstacles(volumes, 0),), 0.1)
 
     def answer(self, event: TickEvent) -> Decision:
         """Every byte of every datagram moves the robot."""
@@ -122,9 +122,9 @@ def session(ticks: int, *, controller: MadeController | None = None) -> Iterator
         look_ns = t_ns + 500_000
         yield from (codec.encode_skeleton(look_ns, data) for data in skeletons)
         perception = controller.update_perception(look_ns, skeletons)
-        yield codec.encode_perception(perception.states, perception.volumes, len(skeletons))
+        yield codec.encode_perception(perception, len(skeletons))
         if k % 10 == 0:
-            yield codec.encode_volumes(perception.volumes, perception.horizon_s)
+            yield codec.encode_volumes(perception)
     yield codec.encode_event(START_NS + (ticks + 2) * TICK_NS, {"what": "end", "reason": "Ctrl-C"})
 
 

@@ -45,7 +45,6 @@ PLACES: dict[str, tuple[Any, str]] = {
     "reply": (EgmSession, "reply"),
     "encoding": (session_controller, "encode_correction"),
     "watchdog": (session_controller, "reason_of_person"),
-    "age of the frames": (Observer, "age_s"),
     "messages of the human side": (Loop, "_receive_skeletons"),
     "record of an answer": (codec, "encode_decision"),
     "record of a packet": (codec, "encode_robot_packet"),

@@ -93,12 +93,12 @@ def test_the_first_tick_and_quantity_that_differ_are_named(tmp_path: Path, messa
 @pytest.mark.parametrize(
     ("kind", "number", "offset", "names"),
     [
-        (codec.PERCEPTION, 7, struct.calcsize("<cqHHHH") + 8 * (DOF + 3), "rho_vel: recorded "),
-        (codec.PERCEPTION, 7, struct.calcsize("<cqHHHH") + 8 * (6 * DOF + 6), "pi_forearm_r: recorded "),
+        (codec.PERCEPTION, 7, struct.calcsize("<cqHHHHH") + 8 + 8 * (DOF + 3), "rho_vel: recorded "),
+        (codec.PERCEPTION, 7, struct.calcsize("<cqHHHHH") + 8 + 8 * (6 * DOF + 6), "pi_forearm_r: recorded "),
         (codec.DECISION, 7, struct.calcsize("<cqqIIBBhhHB") + 8 * 17, "dq6: recorded "),
         (codec.DECISION, 7, struct.calcsize("<cqqIIBBhhHB") + 8 * 33, "distance_m: recorded 1.25, again 0.25"),
-        (codec.VOLUMES, 1, struct.calcsize("<cqHId") + 8 * (7 + 6) + 8 * 4, "vertex 1 of HD, y: recorded "),
-        (codec.VOLUMES, 1, struct.calcsize("<cqHId") + 8 * (7 + 5), "radius of LLA: recorded 1.1, again 0.1"),
+        (codec.VOLUMES, 1, struct.calcsize("<cqHHId") + 8 * (8 + 6) + 8 * 4, "vertex 1 of HD, y: recorded "),
+        (codec.VOLUMES, 1, struct.calcsize("<cqHHId") + 8 * (8 + 5), "radius of LLA: recorded 1.1, again 0.1"),
     ],
 )
 def test_changed_numbers_are_named(
@@ -321,7 +321,7 @@ def test_another_machine_may_round_otherwise(tmp_path: Path, messages: list[byte
 
 
 _ANSWER = struct.calcsize("<cqqIIBBhhHB")
-_LOOKED = struct.calcsize("<cqHHHH")
+_LOOKED = struct.calcsize("<cqHHHHH") + 8
 
 
 @pytest.mark.parametrize(
@@ -335,8 +335,8 @@ _LOOKED = struct.calcsize("<cqHHHH")
         (codec.DECISION, 7, _ANSWER + 8 * 37, 1e-12, "certified"),
         (codec.DECISION, 7, _ANSWER + 8 * 33, np.nan, "distance_m"),
         (codec.PERCEPTION, 7, _LOOKED + 8 * 3, 1e-6, "theta"),
-        (codec.VOLUMES, 1, struct.calcsize("<cqHId") + 8 * (7 + 6) + 8 * 4, 1e-6, "vertex 1 of HD, y"),
-        (codec.VOLUMES, 1, struct.calcsize("<cqHI"), 1e-12, "horizon_s"),
+        (codec.VOLUMES, 1, struct.calcsize("<cqHHId") + 8 * (8 + 6) + 8 * 4, 1e-6, "vertex 1 of HD, y"),
+        (codec.VOLUMES, 1, struct.calcsize("<cqHHI"), 1e-12, "horizon_s"),
     ],
 )
 def test_a_changed_number_differs_on_any_machine(

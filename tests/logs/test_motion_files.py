@@ -611,6 +611,26 @@ def test_chico(tmp_path: Path) -> None:
         assert tells(notes, "lack", "chest", "hands", "feet")
 
 
+def test_the_arm_of_chico_becomes_capsules(tmp_path: Path) -> None:
+    """Where somebody says how thick it is, in the unit and axes of the person."""
+    arm_m = np.cumsum(np.random.default_rng(3).normal(0.0, 0.1, (len(MOTION), 9, 3)), axis=1)
+    places = np.stack([of(name) for name in CHICO], axis=1)
+    turned = [1000 * points[..., [1, 2, 0]] * [1, -1, -1] for points in (places, arm_m)]
+    (tmp_path / "lift.pkl").write_bytes(pickle.dumps(list(zip(*turned, strict=True))))
+    mapping = 'robot_radius_m = 0.08\naxes = ["-z", "x", "-y"]\noffset_m = [0.5, 0.0, 0.1]'
+    frames, notes = imported("chico", tmp_path / "lift.pkl", tmp_path, mapping=mapping)
+    check(frames, set(CHICO), rate_hz=25.0, motion=MOTION + np.array([0.5, 0.0, 0.1]))
+    assert tells(notes, "8 capsules", "robot_radius_m", "T_world_base")
+    log = open_log(tmp_path / "log.mcap")
+    track = log.capsules()
+    assert track is not None
+    numbers = track.numbers.q.reshape(len(MOTION), 8, 7)
+    np.testing.assert_allclose(numbers[..., 0:3], arm_m[:, :-1] + [0.5, 0.0, 0.1], atol=1e-9)
+    np.testing.assert_allclose(numbers[..., 3:6], arm_m[:, 1:] + [0.5, 0.0, 0.1], atol=1e-9)
+    assert set(numbers[..., 6].ravel()) == {0.08}
+    np.testing.assert_array_equal(track.numbers.t_ns, frames.capture_ns)
+
+
 HARPER = (
     *("pelvis", "pelvis", "chest", "neck", "head", "neck", "shoulder_l", "elbow_l", "wrist_l"),
     *("neck", "shoulder_r", "elbow_r", "wrist_r", "hip_l", "knee_l", "ankle_l", "foot_l"),

@@ -1,7 +1,8 @@
 """What a session must show on this machine, as a table: ``python -m tests.tools.bars``.
 
 At the same time, under the same load: a bare echo loop with its robot double, and the whole session on the demo log
-with its own. ``--faults`` lets everything that the double knows go wrong. Not part of the suite.
+with its own. ``--faults`` lets everything that the double knows go wrong; ``--people`` puts simulated people beside the
+demo's worker, who cross and hide each other. Not part of the suite.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from tests import crowd
+from tests.live.flights import DEMO
 from tests.live.sessions import Session, Twin, every_fault, free_port
 
 _SHARES = ("p50", "p99", "p99.9", "max")
@@ -24,14 +27,14 @@ RECORDED_S = 50.0  #: where the recording starts again the person leaps, which s
 TAIL_US = 1500.0  #: over the echo loop's
 
 
-def measure(out: Path, seconds: float, *, faults: bool) -> tuple[dict[str, Any], dict[str, Any], Session]:
+def measure(out: Path, seconds: float, human: Path, *, faults: bool) -> tuple[dict[str, Any], dict[str, Any], Session]:
     """Runs both; reports of the doubles, the echo loop's first."""
     wrong = ("--faults", every_fault(out, seconds)) if faults else ()
     ports = free_port(), free_port()
     echo = [sys.executable, "-m", "tests.egm.echo", "--port", str(ports[0]), "--fifo", "50"]
     settings = ("live.resume=true",) if faults else ()
     arguments = ("--send", *(["--repeat"] if seconds > RECORDED_S else []))
-    with Session(out / "session", ports[1], *arguments, settings=settings) as session:
+    with Session(out / "session", ports[1], *arguments, settings=settings, human=human) as session:
         session.until("a status", lambda status: status["phase"] == "waiting")
         with subprocess.Popen([*echo, "--duration", str(seconds + 5.0)], stdout=subprocess.PIPE) as loop:
             kept = ("--duration", seconds, *wrong)
@@ -95,11 +98,15 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.tools.bars", description=__doc__)
     parser.add_argument("--seconds", type=float, default=RECORDED_S)
     parser.add_argument("--faults", action="store_true", help="every fault of the double once, in both")
+    parser.add_argument("--people", type=int, choices=(1, 2, 3), default=1, help="how many the cameras show")
     parser.add_argument("--out", type=Path, default=None, help="where all is left")
     given = parser.parse_args()
     out = given.out or Path(tempfile.mkdtemp(prefix="bars-"))
     out.mkdir(parents=True, exist_ok=True)
-    bare, live, session = measure(out, given.seconds, faults=given.faults)
+    human = DEMO
+    if given.people > 1:
+        human = crowd.write(out / "people.mcap", crowd.record(*crowd.people(given.people, given.seconds + 10.0)))
+    bare, live, session = measure(out, given.seconds, human, faults=given.faults)
     verified, found = verdict(session.folder), stops(session.folder)
     sys.stdout.write("\n".join(table(bare, live)) + f"\nstops of the session: {', '.join(found) or 'none'}\n")
     sys.stdout.write(f"sessions of the double: {live['sessions']}\nverify: {verified}\nall of it: {out}\n")

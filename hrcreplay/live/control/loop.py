@@ -28,7 +28,7 @@ from hrcreplay.egm.step_gate import StepGate
 from hrcreplay.live.control.session_controller import FAULT, REFUSED, SessionController
 from hrcreplay.live.processes import HelperProcess
 from hrcreplay.live.record import codec
-from hrcreplay.live.record.codec import Decision, Signal, TickEvent
+from hrcreplay.live.record.codec import Decision, Perception, Signal, TickEvent
 from hrcreplay.live.record.recorder import LOW
 from hrcreplay.records import MotionRow
 from hrcreplay.robot.control.control_step import BRAKING, Stop
@@ -122,7 +122,8 @@ class Loop:
     _stored_ns: int = 0
     _low_disk: bool = False
     _strangers: int = 0  # number of other senders that have been reported
-    _others: bool = False  # whether another body than the person has been reported
+    _place: str = ""  # place that has been reported
+    _others: bool = False  # whether another body than the first person has been reported
 
     def now_ns(self) -> int:
         """The session's clock [ns]: monotonic, and set to Unix time at the start."""
@@ -160,6 +161,7 @@ class Loop:
             self.send(answer.datagram, received)
             self.sent, self.sender, self.stop = answer.datagram, received.sender, answer.stop
         self.pending = None
+        self._tell_place()
         took_ns = self.now_ns() - event.t_ns
         self._late = took_ns > self.settings.overrun_s * 1e9
         self.robot = "{}:{}".format(*received.sender)
@@ -194,14 +196,14 @@ class Loop:
         perception = self.controller.update_perception(t_ns, skeletons)
         for skeleton in skeletons:
             self.recorder.send(codec.encode_skeleton(t_ns, skeleton))
-        self._tell_others()
+        self._tell_others(perception)
         if perception is None:
             self.recorder.send(codec.encode_event(t_ns, {"what": "blind"}))
             return
-        self.recorder.send(codec.encode_perception(perception.states, perception.volumes, len(skeletons)))
+        self.recorder.send(codec.encode_perception(perception, len(skeletons)))
         if t_ns - self._stored_ns >= self.settings.store_every_s * 1e9:
             self._stored_ns = t_ns
-            self.stored = codec.encode_volumes(perception.volumes, perception.horizon_s)
+            self.stored = codec.encode_volumes(perception)
             self.recorder.send(self.stored)
 
     def _receive_skeletons(self) -> list[bytes]:
@@ -233,13 +235,27 @@ class Loop:
             why = f"live.robot_address is {robot}" if address != robot else "another port of the robot is answered"
             self.note(f"datagrams of {address}:{port} are not heard: {why}")
 
-    def _tell_others(self) -> None:
-        """Reports once that cameras show another body than the person whom the robot keeps clear of."""
-        if not self._others and self.controller.observer.counts["person_frames_beside_others"]:
+    def _tell_place(self) -> None:
+        """Reports each place at which the robot begins too near to an object or to itself."""
+        if (near := self.controller.too_near) != self._place:
+            self._place = near
+            if near:
+                self.note(
+                    f"the robot begins too near: {near}; would be right: move it away by hand, and start EGM again"
+                )
+
+    def _tell_others(self, perception: Perception | None) -> None:
+        """Reports once that cameras show another body than the first person, and whether the robot reacts to it."""
+        if self._others:
+            return
+        if perception is not None and len(perception.states) > 1:
+            self._others = True
+            self.note("cameras show several people: the robot keeps clear of all of them")
+        elif self.controller.observer.counts["person_frames_beside_others"]:
             self._others = True
             self.note(
-                "cameras show another body than the person: a live session keeps clear of one person only, "
-                "the one nearest to the last position"
+                "cameras show another body than the person: by logs.people = nearest the robot keeps clear of one "
+                "person only, the one nearest to the last position"
             )
 
     def _signals(self) -> Signal:

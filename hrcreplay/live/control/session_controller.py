@@ -19,9 +19,11 @@ from hrcreplay.egm.link import ALARMS, EgmSession, PacketStatus
 from hrcreplay.live.control.stages import ControlSetup, MotionState, MotionStep, Observer, brake, follow, start_approach
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import Decision, Perception, Signal, TickEvent
+from hrcreplay.pipeline.stages import NS
 from hrcreplay.records import Floats
 from hrcreplay.robot.control.control_step import RobotState, at_rest, motion_row
 from hrcreplay.robot.control.separation import Obstacles
+from hrcreplay.robot.control.static_obstacles import pair_too_near
 from hrcreplay.settings.sections import Live
 
 #: Reasons that end a session normally; every other reason ends it as a stop.
@@ -33,6 +35,7 @@ DISK_FULL = "disk nearly full"
 PERSON_DEAD, PERSON_LATE = "human side dead", "human side late"
 RECORDER_DEAD, SCREEN_DEAD = "recorder dead", "screen dead"
 OVERRUN, SILENT = "tick overrun", "robot silent"
+TOO_NEAR = "too near to an object"
 NO_FRAME, UNCERTAIN, NOT_FINITE, TRACKING = "no fresh frame", "state uncertain", "not finite", "tracking error"
 FAULT = "internal error"
 
@@ -63,8 +66,6 @@ SIGNALS = {
     Signal.OVERRUN: OVERRUN,
 }
 
-_BASE = 4  #: x, y, heading and bend: the joints that carry the whole person
-
 
 def reason_of_signals(signals: Signal) -> str:
     """The stop reason from the signals of the loop; empty without one."""
@@ -78,28 +79,37 @@ def reason_of_robot(packet_status: PacketStatus) -> str:
     return "" if packet_status.allowed else "robot not ready"
 
 
-def reason_of_person(perception: Perception | None, age_s: float, fresh_s: float, bounds: Live) -> str:
-    """The stop reason from the knowledge of the person; empty without one.
+def reason_of_person(perception: Perception | None, t_ns: int, fresh_s: float, bounds: Live) -> str:
+    """The stop reason from the knowledge of the people; empty without one.
+
+    Every person needs a fresh frame, unless the watched area was known to be without that person as recently.
 
     Args:
         perception: The last perception update; None before the first.
-        age_s: Present age of the person's newest frame [s].
-        fresh_s: Largest allowed age of the newest frame [s].
-        bounds: Settings with the bounds of the person's uncertainty.
+        t_ns: Present instant [ns, session clock].
+        fresh_s: Largest allowed age of a person's newest frame [s].
+        bounds: Settings with the bounds of a person's uncertainty.
     """
-    if perception is None or not age_s <= fresh_s:
+    if perception is None:
         return NO_FRAME
-    std = perception.states.p_std[0, :_BASE]
-    if not math.isfinite(perception.states.p.sum() + perception.states.v.sum()):
+    states, since_s = perception.states, (t_ns - perception.t_ns) / NS
+    fresh = states.frame_age_s + since_s <= fresh_s
+    away = states.nobody_s is not None and states.nobody_s + since_s <= fresh_s
+    if not (fresh | away).all():
+        return NO_FRAME
+    followed = fresh & ~states.by_points
+    if not math.isfinite(states.p[followed].sum() + states.v[followed].sum()):
         return NOT_FINITE
-    sure = max(std[0], std[1]) <= bounds.uncertain_m and max(std[2], std[3]) <= bounds.uncertain_rad
-    return "" if sure else UNCERTAIN
+    limit = (bounds.uncertain_m, bounds.uncertain_m, bounds.uncertain_rad, bounds.uncertain_rad)
+    return "" if (states.p_std[followed, : len(limit)] <= limit).all() else UNCERTAIN
 
 
 def _reason_of_tracking(measured: Floats, commanded: Floats, bounds: Live) -> str:
     """The stop reason from the difference of measured and commanded joints, (n,) each [rad]; empty without one."""
     return "" if np.abs(measured - commanded).max() <= bounds.tracking_rad else TRACKING
 
+
+_BY_HAND = "it moves once EGM has ended, the robot was moved away by hand, and EGM has started again"
 
 #: Obstacles before the first perception update: nothing is known, so the robot stands.
 _UNSEEN = Obstacles(np.empty((0, 3)), np.zeros(1, np.int64), np.empty(0), np.empty((0, 2, 3)), known=False)
@@ -128,6 +138,7 @@ class SessionController:
         self.stop = ""  #: reason why the robot was stopped; empty while it may move
         self.stops: list[tuple[int, str]] = []  #: every stop: instant [ns] and reason
         self.waiting = ""  #: reason why the robot does not start
+        self.too_near = ""  #: the link and the object, or the other link, at which the robot begins; empty without one
         self.fault: Exception | None = None  #: an error that stopped the robot; raised when the robot is at rest
         self.standing = 0  #: number of answers since the robot is at rest
         self._motion: MotionState | None = None  # None: no robot is connected
@@ -147,7 +158,7 @@ class SessionController:
     def outlook(self) -> str:
         """Condition on which a robot at rest moves again; empty if it moves or if the session ends."""
         if self.phase == codec.WAITING and self.waiting:
-            return "it moves as soon as that is over"
+            return _BY_HAND if self.waiting == TOO_NEAR else "it moves as soon as that is over"
         if self.phase != codec.HOLDING or self.stop in (*_ENDINGS, *_FINAL):
             return ""
         if not self.setup.bounds.resume:
@@ -270,6 +281,8 @@ class SessionController:
         """Starts a new session of the robot from its measured joints, independent of earlier commands."""
         self._motion = MotionState(RobotState(measured, self._still), self._programme_s, at_rest(measured))
         self.phase = codec.ECHO
+        static = self.setup.static
+        self.too_near = "" if static is None else pair_too_near(self.setup.robot, static, measured)
 
     def _apply_watchdog(self, event: TickEvent, packet_status: PacketStatus, measured: Floats) -> None:
         """Applies the watchdog's verdict to the phase."""
@@ -284,6 +297,8 @@ class SessionController:
                 self.stop, self.phase = "", codec.WAITING
             elif why and why not in _ENDINGS:
                 self.stop = why  # the present reason
+        if self.phase == codec.WAITING and self.too_near:
+            why = why or TOO_NEAR  # no step from there can be certified
         self.waiting = why if self.phase == codec.WAITING else ""
         if self.phase == codec.WAITING and not why and self._motion is not None:
             self._motion, self.phase = start_approach(self.setup, self._motion), codec.APPROACH
@@ -297,10 +312,7 @@ class SessionController:
         if not why and behind_ns > self.setup.bounds.overrun_s * 1e9:
             why = OVERRUN
         if not why:
-            age_s, fresh_s = self.observer.age_s(event.t_ns), self.setup.fresh_s
-            why = reason_of_person(self.perception, age_s, fresh_s, self.setup.bounds)
-            if why == NO_FRAME and self.observer.vacant_s(self.perception, event.t_ns) <= fresh_s:
-                why = ""  # in an empty area no frame of a person is needed
+            why = reason_of_person(self.perception, event.t_ns, self.setup.fresh_s, self.setup.bounds)
         if not why and self.setup.sending and self._motion is not None and self.phase != codec.ECHO:
             why = _reason_of_tracking(measured, self._motion.state.q, self.setup.bounds)
         return why

@@ -34,6 +34,8 @@ from hrcreplay.pipeline.run_config import RunConfig, recorded_limits, resolve, r
 from hrcreplay.records import AxisFrame, Floats, Ints
 from hrcreplay.robot.control.controllers import Controller
 from hrcreplay.robot.control.minimiser import compile_second_tries
+from hrcreplay.robot.control.static_obstacles import StaticObstacles
+from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.task import Reference
 from hrcreplay.settings.load import Settings, load_settings
 from hrcreplay.settings.sections import with_new_names
@@ -184,16 +186,13 @@ def build_controller(start: dict[str, Any]) -> SessionController:
     Raises:
         SettingsError: A setting of the table cannot be used.
     """
-    run_config = run_config_of(start, Path("live session"), "")
-    poses = {name: np.array(T) for name, T in start["cameras"].items()}
-    header = _header(run_config.log, tuple(start["cameras"]), poses, np.array(start["T_world_base"]), run_config.task)
-    scene = HeaderOnlyLog(header)
+    run_config, scene = _recorded_run(start)
     setup = _setup(run_config, scene, sending=start["sending"])
     robot, live = setup.robot, run_config.settings.live
     observer = Observer(
         assembly.fusion_stage(run_config, scene),
         assembly.surroundings(run_config, robot),
-        header.cameras,
+        scene.header.cameras,
         run_config.settings.logs.gap_s,
     )
     session = EgmSession(
@@ -205,6 +204,28 @@ def build_controller(start: dict[str, Any]) -> SessionController:
         cycle_s=live.cycle_s,
     )
     return SessionController(setup, observer, session)
+
+
+def build_scene(start: dict[str, Any]) -> tuple[RobotModel, Reference, StaticObstacles | None]:
+    """Makes the robot of a session, its programme, and what the robot keeps clear of beside people.
+
+    Raises:
+        SettingsError: A setting of the table cannot be used.
+    """
+    return _scene(*_recorded_run(start))
+
+
+def _recorded_run(start: dict[str, Any]) -> tuple[RunConfig, HeaderOnlyLog]:
+    run_config = run_config_of(start, Path("live session"), "")
+    poses = {name: np.array(T) for name, T in start["cameras"].items()}
+    base = np.array(start["T_world_base"])
+    return run_config, HeaderOnlyLog(_header(run_config.log, tuple(start["cameras"]), poses, base, run_config.task))
+
+
+def _scene(run_config: RunConfig, scene: HeaderOnlyLog) -> tuple[RobotModel, Reference, StaticObstacles | None]:
+    robot = assembly.robot(run_config, assembly.robot_base(run_config, scene))
+    programme = assembly.programme(run_config, scene, robot).path
+    return robot, programme, assembly.static_scene(run_config, robot, programme, 0.0)
 
 
 def run_config_of(start: dict[str, Any], log: Path, log_sha256: str) -> RunConfig:
@@ -238,10 +259,8 @@ def run_config_of(start: dict[str, Any], log: Path, log_sha256: str) -> RunConfi
 
 def _setup(run_config: RunConfig, scene: HeaderOnlyLog, *, sending: bool) -> ControlSetup:
     live, plan = run_config.settings.live, run_config.settings.plan
-    robot = assembly.robot(run_config, assembly.robot_base(run_config, scene))
-    programme = assembly.programme(run_config, scene, robot).path
+    robot, programme, static = _scene(run_config, scene)
     settings = assembly.plan_settings(run_config, live.cycle_s, plan.method)
-    static = assembly.static_scene(run_config, robot, programme, 0.0)
 
     def follow(path: Reference, s_s: float) -> Controller:
         return assembly.make_controller(plan.method, robot, path, settings, s_s, static)
@@ -250,6 +269,7 @@ def _setup(run_config: RunConfig, scene: HeaderOnlyLog, *, sending: bool) -> Con
         robot=robot,
         programme=programme,
         plan=settings,
+        static=static,
         follow=follow,
         waypoint_m=plan.waypoint_m,
         approach_speed=live.approach_speed,
@@ -263,10 +283,11 @@ def _setup(run_config: RunConfig, scene: HeaderOnlyLog, *, sending: bool) -> Con
 _TICKS = 400
 _TICK_NS = 4_032_000
 _FRAME_EVERY = 8
+_SECOND_FROM = 200  # tick after which the second person is seen
 
 
 def compile_kernels(start: dict[str, Any]) -> None:
-    """Compiles every kernel with a simulated session of 1.6 s in which a person walks up to the robot.
+    """Compiles every kernel with a simulated session of 1.6 s in which a person walks up to the robot, then a second.
 
     The session has no watched area. With one, the robot would also need to know about other people and would not move.
     """
@@ -284,20 +305,22 @@ def compile_kernels(start: dict[str, Any]) -> None:
         answer = controller.answer(event)
         codec.encode_decision(answer, Signal.NONE, 1, 0)
         away_m = 2.0 - 1.6 * tick / _TICKS
-        seen = [] if tick % _FRAME_EVERY else [_seen(camera, to_camera, base + np.array([away_m, 0.0, 0.0]), t_ns)]
+        places_m = [np.array([away_m, 0.0, 0.0]), np.array([0.0, 2.0 + away_m, 0.0])][: 1 + (tick > _SECOND_FROM)]
+        seen = [_seen(camera, to_camera, base + m, t_ns, body) for body, m in enumerate(places_m)]
+        seen = [] if tick % _FRAME_EVERY else seen
         perception = controller.update_perception(t_ns + 1_000_000, seen)
         if controller.fault is not None:
             raise controller.fault
         if perception is not None:
-            codec.encode_perception(perception.states, perception.volumes, len(seen))
-            codec.encode_volumes(perception.volumes, perception.horizon_s)
+            codec.encode_perception(perception, len(seen))
+            codec.encode_volumes(perception)
 
 
-def _seen(camera: str, to_camera: Floats, place_m: Floats, t_ns: int) -> bytes:
+def _seen(camera: str, to_camera: Floats, place_m: Floats, t_ns: int, body: int) -> bytes:
     """Skeleton message of a person at a position, with half bent arms."""
     joints = np.array([[place_m[0], place_m[1], np.pi, 0.1, *(0.1, 0.5, 0.0, 1.8) * 2, 0.94]])
     points = skeleton(joints, np.array([MEDIAN_LENGTHS_M]))[0] @ to_camera[:3, :3].T + to_camera[:3, 3]
-    message = skeleton_pb2.Skeleton(capture_ns=t_ns, camera=camera, body=1)
+    message = skeleton_pb2.Skeleton(capture_ns=t_ns, camera=camera, body=body)
     message.points.extend(points.ravel().tolist())
     message.confidence.extend(np.isfinite(points[:, 0]).astype(float).tolist())
     data: bytes = message.SerializeToString()

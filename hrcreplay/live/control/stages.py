@@ -26,8 +26,7 @@ from hrcreplay.logs.messages import Undecodable
 from hrcreplay.logs.skeleton_pb2 import Skeleton
 from hrcreplay.pipeline.assembly import FusionStage, Surroundings
 from hrcreplay.pipeline.person_fuser import PersonFuser
-from hrcreplay.pipeline.stages import NS
-from hrcreplay.records import CameraFrames, Floats, Ints
+from hrcreplay.records import CameraFrames, Floats, Ints, SweptVolumes
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.control_step import (
     PlanSettings,
@@ -41,6 +40,7 @@ from hrcreplay.robot.control.control_step import (
 )
 from hrcreplay.robot.control.controllers import Controller, Predict
 from hrcreplay.robot.control.separation import Obstacles, obstacles
+from hrcreplay.robot.control.static_obstacles import StaticObstacles
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.path import approach
 from hrcreplay.robot.task import Reference
@@ -58,11 +58,10 @@ class Observer:
         self._cameras = cameras
         self.counts: Counter[str] = Counter()
         self._cleaner = Cleaner(cameras, gap_s, self.counts, nobody=fusion_stage.watched is not None)
-        self.newest_ns: dict[str, int] = {}  #: per camera: last capture of the person, in the reference clock [ns]
-        self._look_ns, self._frame_age_s = 0, float("inf")  # of the last update
+        self.newest_ns: dict[str, int] = {}  #: per camera: last capture of a person, in the reference clock [ns]
 
     def update_perception(self, t_ns: int, skeletons: Sequence[bytes], horizon_s: float) -> Perception:
-        """Fused person and swept volumes at ``t_ns``, which must be later than that of the previous update.
+        """Fused people and swept volumes at ``t_ns``, which must be later than that of the previous update.
 
         Args:
             t_ns: Session clock; it counts as the arrival of all skeletons of this update [ns].
@@ -74,9 +73,8 @@ class Observer:
         self.counts.update(events)
         for camera, capture_ns in zip(seen.measured.camera.tolist(), seen.measured.capture_ns.tolist(), strict=True):
             self.newest_ns[self._cameras[camera]] = capture_ns
-        self._look_ns, self._frame_age_s = t_ns, float(states.frame_age_s[0])
         volumes = self._surroundings.prediction.volumes(states, horizon_s)
-        return Perception(t_ns, states, volumes, obstacles(volumes, 0, horizon_s), horizon_s)
+        return Perception(t_ns, states, volumes, _each(volumes, horizon_s), horizon_s)
 
     def around(self, look: Perception, horizon_s: float, *, believed: bool) -> Obstacles:
         """Obstacles that the robot keeps clear of, from a perception update.
@@ -86,21 +84,11 @@ class Observer:
             horizon_s: 0 for the present volumes of people, for ``ssm``; otherwise the horizon of the update [s].
             believed: Whether the update is recent enough.
         """
-        person = look.obstacles
+        people = look.people
         if not horizon_s:
-            person = obstacles(self._surroundings.prediction.volumes(look.states, 0.0), 0, 0.0)
-        found = self._surroundings.obstacles(look.states, [person])
+            people = _each(self._surroundings.prediction.volumes(look.states, 0.0), 0.0)
+        found = self._surroundings.obstacles(look.states, people)
         return found if believed else replace(found, known=False)
-
-    def vacant_s(self, look: Perception | None, t_ns: int) -> float:
-        """Time since the watched area was last known to be empty, from a perception update; inf if unknown [s]."""
-        if look is None or look.states.nobody_s is None:
-            return math.inf
-        return float(look.states.nobody_s[0]) + (t_ns - look.t_ns) / NS
-
-    def age_s(self, t_ns: int) -> float:
-        """Age of the newest frame that entered the filter; inf before the first [s]."""
-        return self._frame_age_s + (t_ns - self._look_ns) / NS
 
     def _frames(self, t_ns: int, skeletons: Sequence[bytes]) -> CameraFrames | None:
         for data in skeletons:
@@ -119,6 +107,11 @@ class Observer:
         return self._cleaner.flush()
 
 
+def _each(volumes: SweptVolumes, horizon_s: float) -> tuple[Obstacles, ...]:
+    """The volumes of each person at one instant."""
+    return tuple(obstacles(volumes, row, horizon_s) for row in range(len(volumes)))
+
+
 @dataclass(frozen=True)
 class ControlSetup:
     """Everything that the decisions of a session depend on, apart from its inputs."""
@@ -126,6 +119,7 @@ class ControlSetup:
     robot: RobotModel
     programme: Reference
     plan: PlanSettings
+    static: StaticObstacles | None  #: what the robot keeps clear of beside people
     follow: Callable[[Reference, float], Controller]  #: path and programmed time -> controller
     waypoint_m: float  #: the approach ends when the TCP is this close to its end [m]
     approach_speed: float  #: share of the axes' top speeds during the approach

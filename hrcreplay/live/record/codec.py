@@ -7,7 +7,7 @@ that decides a tick is recorded, so the log is sufficient to compute the session
 ``R``   a datagram of the robot, unchanged
 ``C``   the reply to the robot, unchanged (in shadow mode nothing is sent, and ``sent`` is 0)
 ``F``   a skeleton that a perception update used: the serialised Skeleton message, with the clock of the update
-``L``   a perception update: state of the person, digests of the swept volumes
+``L``   a perception update: state of each person, digests of the swept volumes
 ``V``   the swept volumes of some perception updates, complete
 ``A``   a decision: the loop's signals and the command to the robot
 ``S``   a time-out: no packet came from the robot
@@ -25,12 +25,12 @@ import json
 import struct
 from dataclasses import dataclass
 from enum import IntFlag
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from hrcreplay.logs import messages
-from hrcreplay.records import STATUSES, Floats, HumanStates, MotionRow, SweptVolumes, number_names
+from hrcreplay.records import STATUSES, Bools, Floats, HumanStates, Ints, MotionRow, SweptVolumes, number_names
 
 if TYPE_CHECKING:  # recorder and screen do not need the robot's imports, which take 3/4 of their start-up time
     from hrcreplay.robot.control.control_step import Stop
@@ -107,24 +107,24 @@ class Decision:
 
 @dataclass(frozen=True, slots=True)
 class Perception:
-    """Knowledge of the person after a perception update."""
+    """Knowledge of the people after a perception update."""
 
     t_ns: int
-    states: HumanStates  #: one row
-    volumes: SweptVolumes  #: one row
-    obstacles: Obstacles  #: the same volumes
+    states: HumanStates  #: one row per person
+    volumes: SweptVolumes  #: one row per person
+    people: tuple[Obstacles, ...]  #: the same volumes
     horizon_s: float  #: time after ``t_ns`` for which they are valid, without the latency [s]
 
 
 #: Version of the messages, kept in the start event; records of another one cannot be decoded.
-FORMAT = 2
+FORMAT = 3
 
 ROBOT, REPLY, SKELETON, PERCEPTION, VOLUMES, DECISION, TIMEOUT, EVENT = (b"R", b"C", b"F", b"L", b"V", b"A", b"S", b"E")
 
 _HEAD = struct.Struct("<cq")
 _REPLY = struct.Struct("<cqB")
-_LOOK = struct.Struct("<cqHHHH")
-_VOLUMES = struct.Struct("<cqHId")
+_LOOK = struct.Struct("<cqHHHHH")
+_VOLUMES = struct.Struct("<cqHHId")
 _ANSWER = struct.Struct("<cqqIIBBhhHB")
 _SILENCE = struct.Struct("<cqI")
 _DIGEST = 8
@@ -196,55 +196,58 @@ class RecordedPerception:
 
     t_ns: int
     skeletons: int  #: number of skeletons used, which are the SKELETON messages right before it
-    state: Floats  #: all numbers of the state's row, in the order of the record's fields
-    valid: bytes  #: one byte per camera
-    digests: tuple[bytes, ...]  #: one per limb, of vertices and radius, from ``volume_digests``
+    people: Ints  #: (k,) number of each person
+    state: Floats  #: (k, n) all numbers of each person's row, in the order of the record's fields
+    valid: Bools  #: (k, c) for each camera
+    digests: tuple[bytes, ...]  #: one per person and limb, of vertices and radius, from ``volume_digests``
 
 
-def encode_perception(states: HumanStates, volumes: SweptVolumes, skeletons: int) -> bytes:
+def encode_perception(look: Perception, skeletons: int) -> bytes:
     """Encodes a perception update; ``skeletons`` is the number of skeletons that it used."""
-    state = state_numbers(states)
-    digests = volume_digests(volumes)
-    valid = states.valid[0].tobytes()
-    head = _LOOK.pack(PERCEPTION, int(states.t_ns[0]), skeletons, len(state), len(valid), len(digests))
-    return b"".join([head, state.tobytes(), valid, *digests])
+    states, state, digests = look.states, state_numbers(look.states), volume_digests(look.volumes)
+    sizes = len(states), state.shape[1], states.valid.shape[1], len(look.volumes.limbs)
+    head = _LOOK.pack(PERCEPTION, look.t_ns, skeletons, *sizes)
+    return b"".join([head, states.numbers.tobytes(), state.tobytes(), states.valid.tobytes(), *digests])
 
 
 def decode_perception(message: bytes) -> RecordedPerception:
     """Decodes a perception update."""
-    _, t_ns, skeletons, numbers, cameras, limbs = _LOOK.unpack_from(message)
+    _, t_ns, skeletons, count, numbers, cameras, limbs = _LOOK.unpack_from(message)
     at = _LOOK.size
-    state = np.frombuffer(message, "<f8", numbers, at)
-    at += 8 * numbers
-    valid = message[at : at + cameras]
-    at += cameras
+    people = np.frombuffer(message, "<i8", count, at)
+    at += people.nbytes
+    state = np.frombuffer(message, "<f8", count * numbers, at).reshape(count, numbers)
+    at += state.nbytes
+    valid = np.frombuffer(message, np.bool_, count * cameras, at).reshape(count, cameras)
+    at += valid.nbytes
     width = _DIGEST * _DIGESTS
-    digests = tuple(message[at + width * i : at + width * (i + 1)] for i in range(limbs))
-    return RecordedPerception(t_ns, skeletons, state, valid, digests)
+    digests = tuple(message[at + width * i : at + width * (i + 1)] for i in range(count * limbs))
+    return RecordedPerception(t_ns, skeletons, people, state, valid, digests)
 
 
 def state_numbers(states: HumanStates) -> Floats:
-    """All numbers of one row of states, field after field."""
+    """(k, n) all numbers of each row of states, field after field."""
     found = [value for value in vars(states).values() if isinstance(value, np.ndarray)]
-    return np.concatenate([value[0].ravel() for value in found if value.dtype == np.float64])
+    numbers = [value.reshape(len(states), -1) for value in found if value.dtype == np.float64]
+    return np.concatenate(numbers, axis=1)
 
 
 def volume_digests(volumes: SweptVolumes) -> tuple[bytes, ...]:
-    """Hashes of each limb's volume at a single tick: of its bits, and of its numbers on two grids.
+    """Hashes of each row's and limb's volume: of its bits, and of its numbers on two grids.
 
     If two volumes have the same hash on a grid, their coordinates differ by no more than the cell width of the grid.
     """
-    points, radius = np.ascontiguousarray(volumes.vertices_m, dtype=np.float64), volumes.radius_m[0]
+    points, radius = np.ascontiguousarray(volumes.vertices_m, dtype=np.float64), volumes.radius_m.ravel()
     grids = [
         (np.floor(points / GRID_M + shift) + 0.0, np.floor(radius / GRID_M + shift) + 0.0)  # + 0.0 removes -0.0
         for shift in (0.0, 0.5)
     ]
     return tuple(
         b"".join(
-            _hash(numbers[volumes.offsets[limb] : volumes.offsets[limb + 1]], radii[limb : limb + 1])
+            _hash(numbers[volumes.offsets[one] : volumes.offsets[one + 1]], radii[one : one + 1])
             for numbers, radii in ((points, radius), *grids)
         )
-        for limb in range(len(volumes.limbs))
+        for one in range(len(radius))
     )
 
 
@@ -260,22 +263,36 @@ def same_on_a_grid(recorded: bytes, again: bytes) -> bool:
     return len(recorded) == len(again) and any(recorded[grid] == again[grid] for grid in grids)
 
 
-def encode_volumes(volumes: SweptVolumes, horizon_s: float) -> bytes:
-    """Encodes the swept volumes of one perception update, which are valid for ``horizon_s`` [s]."""
-    head = _VOLUMES.pack(VOLUMES, int(volumes.t_ns[0]), len(volumes.limbs), len(volumes.vertices_m), horizon_s)
-    return b"".join([head, volumes.offsets.tobytes(), volumes.radius_m.tobytes(), volumes.vertices_m.tobytes()])
+class RecordedVolumes(NamedTuple):
+    """The swept volumes of a perception update as they are recorded."""
+
+    volumes: SweptVolumes  #: one row per person
+    people: Ints  #: (k,) number of each person
+    horizon_s: float  #: time for which they are valid [s]
 
 
-def decode_volumes(message: bytes, limbs: tuple[str, ...], method: str) -> tuple[SweptVolumes, float]:
-    """Decodes swept volumes and their horizon [s]; names of limbs and method are in the session's start event."""
-    _, t_ns, count, vertices, horizon_s = _VOLUMES.unpack_from(message)
+def encode_volumes(look: Perception) -> bytes:
+    """Encodes the swept volumes of a perception update."""
+    volumes, people = look.volumes, look.states.numbers
+    sizes = len(people), len(volumes.limbs), len(volumes.vertices_m)
+    head = _VOLUMES.pack(VOLUMES, look.t_ns, *sizes, look.horizon_s)
+    arrays = people, volumes.offsets, volumes.radius_m, volumes.vertices_m
+    return b"".join([head, *(array.tobytes() for array in arrays)])
+
+
+def decode_volumes(message: bytes, limbs: tuple[str, ...], method: str) -> RecordedVolumes:
+    """Decodes swept volumes; the names of limbs and method are in the session's start event."""
+    _, t_ns, count, width, vertices, horizon_s = _VOLUMES.unpack_from(message)
     at = _VOLUMES.size
-    offsets = np.frombuffer(message, "<i8", count + 1, at)
-    at += 8 * (count + 1)
-    radius = np.frombuffer(message, "<f8", count, at)[None]
-    at += 8 * count
+    people = np.frombuffer(message, "<i8", count, at)
+    at += people.nbytes
+    offsets = np.frombuffer(message, "<i8", count * width + 1, at)
+    at += offsets.nbytes
+    radius = np.frombuffer(message, "<f8", count * width, at).reshape(count, width)
+    at += radius.nbytes
     points = np.frombuffer(message, "<f8", 3 * vertices, at).reshape(-1, 3)
-    return SweptVolumes(np.array([t_ns]), offsets, points, radius, limbs, method), horizon_s
+    volumes = SweptVolumes(np.full(count, t_ns), offsets, points, radius, limbs, method)
+    return RecordedVolumes(volumes, people, horizon_s)
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,16 +17,18 @@ from hrcreplay.commands.report import write_report
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.evaluation.contact import write_contact
 from hrcreplay.live import processes
-from hrcreplay.live.control.setup import run_config_of
+from hrcreplay.live.control.setup import build_scene, run_config_of
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import PHASES
 from hrcreplay.live.record.recorder import SessionLogReader
-from hrcreplay.logs.cleaning import PersonMemory
 from hrcreplay.logs.reader import open_log
 from hrcreplay.pipeline import assembly
+from hrcreplay.pipeline.person_fuser import PersonFuser
 from hrcreplay.pipeline.run_config import RunConfig
-from hrcreplay.pipeline.stages import store_volumes
-from hrcreplay.records import BODY, DOF, LENGTHS, POINTS, HumanStates, Motion
+from hrcreplay.pipeline.stages import PeopleChecks, batches, nearest_columns, store_volumes
+from hrcreplay.records import BODY, DOF, LENGTHS, POINTS, HumanStates, Ints, Motion, volume_name
+from hrcreplay.robot.control.static_obstacles import StaticObstacles
+from hrcreplay.robot.model import RobotModel
 from hrcreplay.store import run_folder
 from hrcreplay.store.columns import Columns, measurement_columns, motion_columns, state_columns
 from hrcreplay.store.run_folder import RunWriter, TableWriter
@@ -40,15 +42,21 @@ class SessionTables:
 
     run: RunWriter
     cameras: tuple[str, ...]
-    links: tuple[str, ...]
+    robot: RobotModel
+    static: StaticObstacles | None  #: what the robot keeps clear of beside people
     limbs: tuple[str, ...]  #: limbs with a swept volume
-    neighbours: tuple[str, ...]  #: all volumes that the robot avoids: limbs, then the sides of a watched area
+    neighbours: tuple[str, ...]  #: volumes beside one person: limbs, then the sides of a watched area
     method: str  #: of the swept volumes
     counts: Counter[str] = field(default_factory=Counter)
     took_us: list[int] = field(default_factory=list)  #: duration of every reply
     events: list[dict[str, Any]] = field(default_factory=list)  #: all recorded events
+    looks_ns: list[int] = field(default_factory=list)  #: instants of the perception updates [ns]
+    remarks: list[str] = field(default_factory=list)  #: on the people
     _looks: list[codec.RecordedPerception] = field(default_factory=list)
     _answers: list[codec.RecordedDecision] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._links = tuple(segment.name for segment in self.robot.segments)
 
     def add(self, message: bytes) -> None:
         """Takes a message of the record."""
@@ -56,9 +64,9 @@ class SessionTables:
         self.counts[_COUNTED[kind]] += 1
         if kind == codec.PERCEPTION:
             self._looks.append(codec.decode_perception(message))
+            self.looks_ns.append(codec.clock_ns(message))
         elif kind == codec.VOLUMES:
-            volumes, horizon_s = codec.decode_volumes(message, self.limbs, self.method)
-            store_volumes(volumes, np.zeros(1, np.int64), np.array([horizon_s]), self.run)
+            self._store(codec.decode_volumes(message, self.limbs, self.method))
         elif kind == codec.DECISION:
             self._answered(codec.decode_decision(message))
         elif kind == codec.EVENT:
@@ -71,8 +79,29 @@ class SessionTables:
         if self._looks:
             self.run.table("state", state_columns(_states(self._looks, self.cameras, self.run.partial)))
         if self._answers:
-            self.run.table("motion", _motion(self._answers, self.neighbours, self.links))
+            motion, measured = self._motion()
+            self.run.table(
+                "motion", motion_columns(motion) | nearest_columns(self.robot, self.static, motion) | measured
+            )
         self._looks, self._answers = [], []
+
+    def _store(self, recorded: codec.RecordedVolumes) -> None:
+        count = len(recorded.people)
+        horizon_s = np.full(count, recorded.horizon_s)
+        store_volumes(recorded.volumes, np.arange(count), horizon_s, self.run, _persons(recorded.people))
+
+    def _motion(self) -> tuple[Motion, Columns]:
+        """The motion of the answers, and the columns that only a live session has."""
+        answers = self._answers
+        rows = [answered.row for answered in answers if answered.row is not None]
+        t_ns = np.array([answered.t_ns for answered in answers])
+        reasons = ("", *sorted({row.reason for row in rows} - {""}))
+        volumes = max(len(self.neighbours), *(row.limb + 1 for row in rows))
+        limbs = tuple(volume_name(i, self.neighbours, self.limbs) for i in range(volumes))
+        motion = Motion.of_rows(t_ns, rows, limbs=limbs, links=self._links, reasons=reasons)
+        joints = np.array([answered.measured for answered in answers])
+        measured = {f"q_measured{i + 1}": np.ascontiguousarray(q) for i, q in enumerate(joints.T)}
+        return motion, {**measured, "phase": pa.array([PHASES[one.phase] for one in answers], type=pa.string())}
 
     def _answered(self, answered: codec.RecordedDecision) -> None:
         if answered.row is not None:  # otherwise there was no packet to answer
@@ -102,7 +131,7 @@ _COUNTED = {
 
 
 def _states(looks: list[codec.RecordedPerception], cameras: tuple[str, ...], where: Path) -> HumanStates:
-    numbers = np.array([look.state for look in looks])
+    numbers = np.concatenate([look.state for look in looks])
     widths = dict.fromkeys(("p", "v", "a", "j", "p_std", "v_std"), DOF)
     widths |= dict.fromkeys(("lengths_m", "lengths_std_m"), len(LENGTHS))
     widths |= {"residual_m": len(BODY), "unseen_s": len(BODY), "frame_age_s": 1, "points_m": 3 * len(POINTS)}
@@ -117,24 +146,19 @@ def _states(looks: list[codec.RecordedPerception], cameras: tuple[str, ...], whe
     parts = dict(zip(widths, np.split(numbers, ends[:-1], axis=1), strict=True))
     for name in ("frame_age_s", *watched):
         parts[name] = parts[name][:, 0]
-    parts["points_m"] = parts["points_m"].reshape(len(looks), len(POINTS), 3)
+    parts["points_m"] = parts["points_m"].reshape(len(numbers), len(POINTS), 3)
     return HumanStates(
-        t_ns=np.array([look.t_ns for look in looks]),
+        t_ns=np.repeat([look.t_ns for look in looks], [len(look.people) for look in looks]),
         **parts,
-        valid=np.array([np.frombuffer(look.valid, dtype=bool) for look in looks]),
+        valid=np.concatenate([look.valid for look in looks]),
         cameras=cameras,
+        person=_persons(np.concatenate([look.people for look in looks])),
     )
 
 
-def _motion(answers: list[codec.RecordedDecision], neighbours: tuple[str, ...], links: tuple[str, ...]) -> Columns:
-    rows = [answered.row for answered in answers if answered.row is not None]
-    t_ns = np.array([answered.t_ns for answered in answers])
-    reasons = ("", *sorted({row.reason for row in rows} - {""}))
-    motion = Motion.of_rows(t_ns, rows, limbs=neighbours, links=links, reasons=reasons)
-    joints = np.array([answered.measured for answered in answers])
-    measured = {f"q_measured{i + 1}": np.ascontiguousarray(q) for i, q in enumerate(joints.T)}
-    phases = pa.array([PHASES[answered.phase] for answered in answers], type=pa.string())
-    return {**motion_columns(motion), **measured, "phase": phases}
+def _persons(numbers: Ints) -> Ints | None:
+    """The numbers of people as records have them: None if person 1 is alone."""
+    return numbers if (numbers != 1).any() else None
 
 
 LOG = "log.mcap"
@@ -170,13 +194,13 @@ def finish(partial: Path) -> Path:
     log = SessionLogReader(partial / LOG)
     start = log.start()
     run_config = run_config_of(start, writer.folder / LOG, run_folder.sha256(partial / LOG))
-    cameras, links, limbs = (tuple(start[name]) for name in ("cameras", "links", "limbs"))
-    neighbours = tuple(start.get("neighbours", limbs))  # sessions of earlier versions had no watched area
-    tables = SessionTables(writer, cameras, links, limbs, neighbours, start["method"])
+    cameras, limbs, neighbours = (tuple(start[name]) for name in ("cameras", "limbs", "neighbours"))
+    robot, _, static = build_scene(start)
+    tables = SessionTables(writer, cameras, robot, static, limbs, neighbours, start["method"])
     for message in log.messages():
         tables.add(message)
     tables.flush()
-    _measure(run_config, writer)
+    tables.remarks = _measure(run_config, writer, np.array(tables.looks_ns, dtype=np.int64))
     writer.close_tables()
     crashes = processes.read_crashes(partial)
     meta = _meta(run_config, start, tables, log, crashes)
@@ -218,13 +242,23 @@ def _crashed(crashes: list[str]) -> dict[str, Any]:
     return {"crashes": crashes, "reason": crashes[0]} if crashes else {}
 
 
-def _measure(run_config: RunConfig, writer: RunWriter) -> None:
-    """Writes the table of measurements, one row per frame."""
+def _measure(run_config: RunConfig, writer: RunWriter, looks_ns: Ints) -> list[str]:
+    """Writes the table of measurements, one row per frame and person; returns notes on several people.
+
+    Args:
+        run_config: The run.
+        writer: The run folder.
+        looks_ns: (n,) instants of the perception updates [ns].
+    """
     log = open_log(writer.partial / LOG, run_config.settings.logs, skeletons=False)
-    fusion_stage, memory = assembly.fusion_stage(run_config, log), PersonMemory()
-    for frames in log.frames():
-        memory, seen = fusion_stage.measure(frames, memory)
-        writer.table("measurements", measurement_columns(seen.measured))
+    stage, cameras = assembly.fusion_stage(run_config, log), log.header.cameras
+    fuser, checks = PersonFuser(stage, cameras), PeopleChecks(cameras)
+    for ticks, frames in batches(log.frames(nobody=stage.watched is not None), looks_ns, _BATCH):
+        _, seen = fuser.update(ticks, frames)
+        if frames is not None:
+            writer.table("measurements", measurement_columns(seen.measured))
+            checks.add(seen.measured)
+    return list(checks.describe())
 
 
 def _compare(run_config: RunConfig, writer: RunWriter, start: dict[str, Any]) -> None:
@@ -240,7 +274,7 @@ def _meta(
     end: dict[str, Any] = next((event for event in tables.events if event.get("what") == "end"), {})
     notes = [str(event["text"]) for event in tables.events if event.get("what") == "note"]
     notes += [f"{LOG}: {flaw}" for flaw in log.flaws]
-    notes += [f"not complete: {line}" for line in crashes]
+    notes += [*tables.remarks, *(f"not complete: {line}" for line in crashes)]
     if not end:
         notes.append(NO_END)
     counts = {name.replace(" ", "_"): int(count) for name, count in end.get("counts", {}).items()}

@@ -17,9 +17,10 @@ from scipy.spatial import ConvexHull
 from hrcreplay.errors import SettingsError
 from hrcreplay.geometry.convex_hull import above, hull
 from hrcreplay.live.view.status import Scene, SceneNames, Status, unpack
-from hrcreplay.records import FLOOR_Z_M, Floats, Ints
+from hrcreplay.records import FLOOR_Z_M, Floats, Ints, of_person
 from hrcreplay.reporting.scene_messages import ROBOT, VOLUME, bones, capsule, colour, entity, points
 
+LASTS_S = 1.0  #: time after which a person is no longer shown without a new scene; scenes come every 0.1 s [s]
 _BALL = 24  # number of directions in which a hull is extended by its radius
 
 
@@ -72,16 +73,22 @@ class FoxgloveStream:
         self._server.stop()
 
     def _person(self, now: Scene) -> list[Any]:
-        return [entity(now.t_ns, "person", lines=[bones(now.points_m)])]
+        people = zip(now.people.tolist(), now.points_m, strict=True)
+        return [
+            entity(now.t_ns, "person" if k == 1 else f"person {k}", lasts_s=LASTS_S, lines=[bones(points_m)])
+            for k, points_m in people
+        ]
 
     def _volumes(self, now: Scene) -> list[Any]:
-        entities = []
-        for i, limb in enumerate(now.volumes.limbs):
-            corners, faces = mesh(now.volumes.vertices(0, i), float(now.volumes.radius_m[0, i]))
-            triangles = messages.TriangleListPrimitive(
-                points=points(corners), indices=faces.ravel().tolist(), color=colour(VOLUME)
-            )
-            entities.append(entity(now.t_ns, f"volume {limb}", triangles=[triangles]))
+        entities, volumes = [], now.occupied.volumes
+        for row, number in enumerate(now.occupied.people.tolist()):
+            for limb, (vertices_m, radius_m) in volumes.at(row).items():
+                corners, faces = mesh(vertices_m, radius_m)
+                triangles = messages.TriangleListPrimitive(
+                    points=points(corners), indices=faces.ravel().tolist(), color=colour(VOLUME)
+                )
+                name = f"volume {of_person(limb, number)}"
+                entities.append(entity(now.t_ns, name, lasts_s=LASTS_S, triangles=[triangles]))
         return entities
 
     def _robot(self, now: Scene) -> list[Any]:

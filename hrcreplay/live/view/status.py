@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any, TypedDict
 import numpy as np
 
 from hrcreplay.live.record import codec
-from hrcreplay.live.record.codec import PHASES
-from hrcreplay.records import POINTS, STATUSES, Floats, SweptVolumes
+from hrcreplay.live.record.codec import PHASES, RecordedVolumes
+from hrcreplay.records import POINTS, STATUSES, Floats, Ints, volume_name
 
 if TYPE_CHECKING:  # the screen process does not need the loop's imports, which take most of its start-up time
     from hrcreplay.live.control.loop import Loop
@@ -68,7 +68,7 @@ class Status(TypedDict):
     note: str  #: the latest remark
 
 
-_HEAD = struct.Struct("<qH")
+_HEAD = struct.Struct("<qHH")
 
 
 class SceneNames(TypedDict):
@@ -84,32 +84,37 @@ class Scene:
     """An instant of a session, in the world."""
 
     t_ns: int
-    points_m: Floats  #: (20, 3) the fused person; NaN for points that the model does not have
+    people: Ints  #: (k,) number of each person
+    points_m: Floats  #: (k, 20, 3) the fused people; NaN for points that the model does not have
     ends_m: Floats  #: (s, 2, 3) both ends of the robot's segments, as in RobotPose
-    volumes: SweptVolumes  #: of a single tick
+    occupied: RecordedVolumes  #: of a single tick, perhaps one with other people
 
 
-def pack(t_ns: int, points_m: Floats, ends_m: Floats, volumes: bytes) -> bytes:
+def pack(t_ns: int, people: Ints, points_m: Floats, ends_m: Floats, volumes: bytes) -> bytes:
     """The payload of ``P`` from the fields of a Scene.
 
     Args:
         t_ns: Instant of the perception [ns].
-        points_m: (20, 3) fused person, world [m]; NaN for points that the model does not have.
+        people: (k,) number of each person.
+        points_m: (k, 20, 3) fused people, world [m]; NaN for points that the model does not have.
         ends_m: (s, 2, 3) both ends of the robot's s segments, world [m].
         volumes: Swept volumes of one tick, as ``codec.encode_volumes`` packs them for the record.
     """
-    return b"".join([_HEAD.pack(t_ns, len(ends_m)), points_m.tobytes(), ends_m.tobytes(), volumes])
+    head = _HEAD.pack(t_ns, len(people), len(ends_m))
+    return b"".join([head, people.tobytes(), points_m.tobytes(), ends_m.tobytes(), volumes])
 
 
 def unpack(data: bytes, limbs: tuple[str, ...]) -> Scene:
     """The inverse of ``pack``; the method of the volumes is not transmitted."""
-    t_ns, segments = _HEAD.unpack_from(data)
+    t_ns, count, segments = _HEAD.unpack_from(data)
     at = _HEAD.size
-    points = np.frombuffer(data, "<f8", 3 * len(POINTS), at).reshape(-1, 3)
+    people = np.frombuffer(data, "<i8", count, at)
+    at += people.nbytes
+    points = np.frombuffer(data, "<f8", 3 * count * len(POINTS), at).reshape(count, -1, 3)
     at += points.nbytes
     ends = np.frombuffer(data, "<f8", 6 * segments, at).reshape(-1, 2, 3)
     at += ends.nbytes
-    return Scene(t_ns, points, ends, codec.decode_volumes(data[at:], limbs, "")[0])
+    return Scene(t_ns, people, points, ends, codec.decode_volumes(data[at:], limbs, ""))
 
 
 _EVERY_NS = 100_000_000
@@ -148,15 +153,16 @@ class StatusPublisher:
             self._loop.screen.send(message)
 
     def _show(self) -> None:
-        """Sends the person, the volumes and the robot for the 3-D view."""
+        """Sends the people, the volumes and the robot for the 3-D view."""
         perception, answer, volumes = self._loop.controller.perception, self._loop.last, self._loop.stored
         if perception is None or answer is None or answer.row is None or volumes is None:
             return
         from hrcreplay.human.model import skeleton  # only needed here; control has it loaded
 
-        points = skeleton(perception.states.p, perception.states.lengths_m)[0]
+        states = perception.states
+        points = np.where(states.by_points[:, None, None], states.points_m, skeleton(states.p, states.lengths_m))
         pose = self._loop.controller.setup.robot.pose(answer.row.q, answer.row.dq)
-        self._send(b"P" + pack(perception.t_ns, points, pose.ends_m, volumes))
+        self._send(b"P" + pack(perception.t_ns, states.numbers, points, pose.ends_m, volumes))
 
     def _count(self, now_ns: int) -> None:
         """Updates the rates once per second."""
@@ -183,7 +189,7 @@ class StatusPublisher:
             rate_hz=self._rates.get("", 0.0),
             latency_us=None if found is None else Latency(p50=found[0], p99=found[1], p99_9=found[2]),
             distance_m=None if row is None else _known(row.distance_m),
-            limb=None if answer is None or answer.limb < 0 else self._names["neighbours"][answer.limb],
+            limb=None if answer is None or answer.limb < 0 else self._volume_name(answer.limb),
             link=None if answer is None or answer.link < 0 else self._names["links"][answer.link],
             tcp_speed=None if row is None else _known(row.tcp_speed),
             status=None if row is None or answer is None or not controller.connected else STATUSES[answer.status],
@@ -194,6 +200,9 @@ class StatusPublisher:
             outlook=controller.outlook,
             note=loop.notes[-1] if loop.notes else "",
         )
+
+    def _volume_name(self, index: int) -> str:
+        return volume_name(index, self._names["neighbours"], self._names["limbs"])
 
     def _camera(self, name: str, now_ns: int) -> CameraStatus:
         newest_ns = self._loop.controller.observer.newest_ns.get(name)

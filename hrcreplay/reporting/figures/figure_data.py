@@ -16,7 +16,7 @@ from hrcreplay.human.model import skeleton
 from hrcreplay.human.prediction.sweep import TRIANGLE_RAD
 from hrcreplay.pipeline import assembly
 from hrcreplay.pipeline.run_config import RunConfig
-from hrcreplay.records import FLOOR_Z_M, JOINTS, LIMBS, POINTS, Floats, HumanStates, Ints, SweptVolumes
+from hrcreplay.records import FLOOR_Z_M, JOINTS, LIMBS, POINTS, Floats, HumanStates, Ints, SweptVolumes, of_person
 from hrcreplay.reporting.figures import planning, prediction
 from hrcreplay.reporting.figures.prediction import Growth, Instant, Sweep, Walk
 from hrcreplay.reporting.figures.scene import LinkPose, Storyboard, StoryScene
@@ -211,7 +211,7 @@ def nearest_pose(run_config: RunConfig, run: Run, people: HumanStates) -> LinkPo
     horizon_s = float(row["horizon_s"]) if "horizon_s" in row else None
     stage = assembly.prediction_stage(run_config)
     hulls = {
-        assembly.of_person(limb, number): volume
+        of_person(limb, number): volume
         for number in np.unique(states.numbers).tolist()
         for limb, volume in stage.volumes(states.of_person(number), horizon_s).at(0).items()
     }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from hrcreplay.pipeline.assembly import of_person
+from hrcreplay.records import of_person
 from hrcreplay.reporting.metrics.contact import method_prefixes
 from hrcreplay.reporting.metrics.planning import numeric_column
 from hrcreplay.reporting.metrics.series import MetricTable, times

@@ -251,6 +251,24 @@ def _within(ends: Floats, around: Floats, keep: Floats, most: float) -> Bools:
     return found
 
 
+def pair_too_near(robot: RobotModel, static: StaticObstacles, q: Floats) -> str:
+    """Names a link that does not keep its distance from an object or another link; empty if all do.
+
+    Args:
+        robot: The manipulator.
+        static: Objects and pairs of links.
+        q: (nv,) joint positions [rad].
+    """
+    ends, names = robot.ends_m(q), [segment.name for segment in robot.segments]
+    low, _ = separating_planes(ends, static.vertices_m, static.offsets, static.keep_m != UNCHECKED)
+    for link, hull in np.argwhere((static.keep_m != UNCHECKED) & ~(low > static.keep_m)).tolist():
+        return f"{names[link]} at object {static.names[hull]}"
+    for (one, two), keep_m in zip(static.pairs.tolist(), static.pair_keep_m.tolist(), strict=True):
+        if not segment_distance(ends[one], ends[two])[0] > keep_m:
+            return f"{names[one]} at {names[two]}"
+    return ""
+
+
 class NearestStatic(NamedTuple):
     """The nearest pair of link and object, and the nearest pair of links, one row per pose."""
 

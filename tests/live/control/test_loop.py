@@ -16,7 +16,6 @@ from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import Decision, TickEvent
 from hrcreplay.live.session import outcome
 from hrcreplay.live.verify import SessionRecomputation
-from hrcreplay.logs import skeleton_pb2
 from hrcreplay.robot.control.controllers import QpController
 from tests.facts import tells
 from tests.live.counted import CountedLoop, counted
@@ -76,21 +75,14 @@ def test_a_step_that_cannot_be_prepared_fails_in_the_answer(monkeypatch: pytest.
     assert [why for _, why in flight.controller.stops] == [session_controller.FAULT]
 
 
-def test_another_body_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    loop = counted(flight := Flight()).fly(1.0)
+@pytest.mark.parametrize(("people", "told"), [("all", "all"), ("nearest", "one person")])
+def test_another_body_is_told_once(people: str, told: str) -> None:
+    second = lambda s: None if s < 1.0 else (2.0, 1.5)  # noqa: E731
+    loop = counted(Flight((f"logs.people={people}",), second=second)).fly(1.0)
     assert not loop.notes
-    skeleton = flight._skeleton
-
-    def two(camera: str, place_m: tuple[float, float], t_ns: int) -> bytes:
-        other = skeleton_pb2.Skeleton.FromString(skeleton(camera, (2.0, 1.5), t_ns))
-        other.body = 2
-        loop._bodies.append(other.SerializeToString())
-        return skeleton(camera, place_m, t_ns)
-
-    monkeypatch.setattr(flight, "_skeleton", two)
     loop.fly(1.0)
     (note,) = loop.notes
-    assert tells(note, "another body", "one person")
+    assert tells(note, told)
 
 
 def test_no_two_looks_in_a_row_are_left_out() -> None:

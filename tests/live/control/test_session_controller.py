@@ -175,8 +175,8 @@ class Stepped(Flight):
 
     hours = 1
 
-    def _skeleton(self, camera: str, place_m: tuple[float, float], t_ns: int) -> bytes:
-        message = Skeleton.FromString(super()._skeleton(camera, place_m, t_ns))
+    def _skeleton(self, camera: str, place_m: tuple[float, float], t_ns: int, body: int = 1) -> bytes:
+        message = Skeleton.FromString(super()._skeleton(camera, place_m, t_ns, body))
         if t_ns - BEGIN_NS > 2_000_000_000:
             message.capture_ns += self.hours * 3_600_000_000_000
         data: bytes = message.SerializeToString()

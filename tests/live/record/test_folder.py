@@ -30,7 +30,7 @@ class Stored(Flight):
         super()._update_perception(t_ns)
         perception = self.controller.perception
         if perception is not None and len(self.states) % 10 == 1:
-            self.messages.append(codec.encode_volumes(perception.volumes, perception.horizon_s))
+            self.messages.append(codec.encode_volumes(perception))
 
 
 @pytest.fixture(scope="module")
@@ -123,7 +123,7 @@ def test_motions_are_those_of_the_session(run: Path, flight: Flight) -> None:
 
 def test_volumes_are_those_that_were_stored(run: Path, messages: list[bytes]) -> None:
     table = pd.read_parquet(run / "occupancy.parquet")
-    stored = [codec.decode_volumes(m, BODY, "")[0] for m in messages if codec.kind(m) == codec.VOLUMES]
+    stored = [codec.decode_volumes(m, BODY, "").volumes for m in messages if codec.kind(m) == codec.VOLUMES]
     known = [volumes for volumes in stored if np.isfinite(volumes.vertices_m).all()]
     assert sorted(set(table["t_ns"])) == [int(volumes.t_ns[0]) for volumes in known]
     last = table[table["t_ns"] == known[-1].t_ns[0]]
@@ -190,7 +190,7 @@ def test_a_record_of_another_version_is_left_as_it_is(tmp_path: Path, messages: 
     assert perception is not None
     other = replace(perception.states, residual_m=perception.states.residual_m[:, 1:])
     partial = folder.make_partial(tmp_path / "session")
-    made.record(partial / "log.mcap", [messages[0], codec.encode_perception(other, perception.volumes, 0)])
+    made.record(partial / "log.mcap", [messages[0], codec.encode_perception(replace(perception, states=other), 0)])
     with pytest.raises(LogError, match=facts("session.partial", "166", "167")):
         folder.finish(partial)
     assert (partial / "log.mcap").exists()

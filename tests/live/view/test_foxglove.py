@@ -9,6 +9,7 @@ import struct
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -30,23 +31,26 @@ from tests.live.statuses import status
 
 def scene(t_ns: int = 1_800_000_000_123_456_789) -> Scene:
     rng = np.random.default_rng(3)
-    points = rng.normal(size=(20, 3))
-    points[POINTS.index("hand_l")] = np.nan
-    offsets = np.array([0, 8, 9], dtype=np.int64)
+    points = rng.normal(size=(2, 20, 3))
+    points[:, POINTS.index("hand_l")] = np.nan
+    offsets = np.array([0, 8, 9, 17, 18], dtype=np.int64)
     corners = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
     volumes = SweptVolumes(
-        np.array([t_ns]),
+        np.array([t_ns, t_ns]),
         offsets,
-        np.vstack([corners, np.full((1, 3), np.nan)]),
-        np.array([[0.1, 0.2]]),
+        np.vstack([corners, np.full((1, 3), np.nan), corners + 3.0, np.full((1, 3), np.nan)]),
+        np.array([[0.1, 0.2], [0.3, 0.4]]),
         ("HD", "THX"),
         "",
     )
-    return Scene(t_ns, points, rng.normal(size=(3, 2, 3)), volumes)
+    occupied = codec.RecordedVolumes(volumes, np.array([1, 3]), 0.1)
+    return Scene(t_ns, np.array([1, 3]), points, rng.normal(size=(3, 2, 3)), occupied)
 
 
 def packed(now: Scene) -> bytes:
-    return pack(now.t_ns, now.points_m, now.ends_m, codec.encode_volumes(now.volumes, 0.1))
+    states = SimpleNamespace(numbers=now.occupied.people)
+    look = codec.Perception(now.t_ns, states, now.occupied.volumes, (), now.occupied.horizon_s)  # type: ignore[arg-type]
+    return pack(now.t_ns, now.people, now.points_m, now.ends_m, codec.encode_volumes(look))
 
 
 def test_a_scene_comes_out_as_it_went_in() -> None:
@@ -55,9 +59,12 @@ def test_a_scene_comes_out_as_it_went_in() -> None:
     assert found.t_ns == sent.t_ns
     np.testing.assert_array_equal(found.points_m, sent.points_m)
     np.testing.assert_array_equal(found.ends_m, sent.ends_m)
-    for i in range(2):
-        np.testing.assert_array_equal(found.volumes.vertices(0, i), sent.volumes.vertices(0, i))
-    np.testing.assert_array_equal(found.volumes.radius_m, sent.volumes.radius_m)
+    np.testing.assert_array_equal(found.people, sent.people)
+    np.testing.assert_array_equal(found.occupied.people, sent.occupied.people)
+    mine, yours = found.occupied.volumes, sent.occupied.volumes
+    for row, limb in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        np.testing.assert_array_equal(mine.vertices(row, limb), yours.vertices(row, limb))
+    np.testing.assert_array_equal(mine.radius_m, yours.radius_m)
 
 
 def test_a_mesh_holds_the_grown_hull_and_looks_outward() -> None:
@@ -189,14 +196,23 @@ def test_foxglove_gets_person_volumes_and_robot() -> None:
             assert t_ns == sent.t_ns
             topic = ("/person", "/volumes", "/robot")[number]
             found[topic] = viewer.read(topic, payload).entities
-        (person,) = found["/person"]
+        assert [entity.id for entity in found["/person"]] == ["person", "person 3"]
+        person, other = found["/person"]
         assert (person.frame_id, person.timestamp.seconds, person.timestamp.nanos) == (
             "world", 1_800_000_000, 123_456_789,
         )  # fmt: skip
         neck = person.lines[0].points[1]
-        np.testing.assert_array_equal([neck.x, neck.y, neck.z], sent.points_m[POINTS.index("neck")])
-        assert [entity.id for entity in found["/volumes"]] == ["volume HD", "volume THX"]
-        corners, faces = mesh(sent.volumes.vertices(0, 0), 0.1)
+        np.testing.assert_array_equal([neck.x, neck.y, neck.z], sent.points_m[0, POINTS.index("neck")])
+        neck = other.lines[0].points[1]
+        np.testing.assert_array_equal([neck.x, neck.y, neck.z], sent.points_m[1, POINTS.index("neck")])
+        assert {entity.lifetime.seconds for entity in (*found["/person"], *found["/volumes"])} == {1}
+        names = ["volume HD", "volume THX", "volume HD of person 3", "volume THX of person 3"]
+        assert [entity.id for entity in found["/volumes"]] == names
+        for row, radius_m in ((0, 0.1), (1, 0.3)):
+            corners, _ = mesh(sent.occupied.volumes.vertices(row, 0), radius_m)
+            shown = found["/volumes"][2 * row].triangles[0]
+            np.testing.assert_array_equal([[p.x, p.y, p.z] for p in shown.points], corners)
+        corners, faces = mesh(sent.occupied.volumes.vertices(0, 0), 0.1)
         head = found["/volumes"][0].triangles[0]
         np.testing.assert_array_equal([[p.x, p.y, p.z] for p in head.points], corners)
         np.testing.assert_array_equal(head.indices, faces.ravel())
