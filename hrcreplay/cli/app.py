@@ -261,7 +261,8 @@ def report(
         typer.Option(
             "--figure",
             metavar="NUMBER",
-            help="With a run folder: only write that figure, such as 14 or horizon; --out names the folder.",
+            help="With a run folder: only write that figure, such as 14, horizon or all, also as PDF; --out names the "
+            "folder.",
         ),
     ] = None,
     list_figures: Annotated[

@@ -39,6 +39,9 @@ from hrcreplay.settings.sections import Logs, setting
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import Run, RunWriter
 
+#: Key of ``--figure`` for all figures for which a run has the data.
+ALL_FIGURES = "all"
+
 
 def write_report(run_config: RunConfig, writer: RunWriter, meta: dict[str, Any], log: Log | None = None) -> None:
     """Writes metrics.json, the figures, report.html, scene.mcap and its layout beside the tables just written.
@@ -88,9 +91,23 @@ def _camera_poses(run_config: RunConfig, log: Log | None) -> dict[str, Floats]:
 
 
 def _draw_figures(
-    run_config: RunConfig, everybody: Run, metrics: Mapping[str, Metric], kinds: Sequence[FigureKind], folder: Path
+    run_config: RunConfig,
+    everybody: Run,
+    metrics: Mapping[str, Metric],
+    kinds: Sequence[FigureKind],
+    folder: Path,
+    *,
+    pdf: bool = False,
 ) -> list[str]:
     """Draws figures of a run with all its people; those of one person for each, where they are made for that.
+
+    Args:
+        run_config: The run.
+        everybody: The run's tables, with all people.
+        metrics: The run's metrics.
+        kinds: The figures.
+        folder: Folder for the files.
+        pdf: True: also as PDF.
 
     Returns:
         The names drawn.
@@ -99,7 +116,7 @@ def _draw_figures(
     for number in everybody.people:
         chosen = [kind for kind in kinds if number == everybody.people[0] or kind.each]
         data = figure_data(run_config, everybody, metrics, chosen, number)
-        drawn += catalogue.draw_all(data, folder, chosen, number)
+        drawn += catalogue.draw_all(data, folder, chosen, number, pdf=pdf)
     return drawn
 
 
@@ -323,26 +340,29 @@ def figure_data(
 
 
 def draw_figures(folder: Path, key: str, out: Path | None) -> list[Path]:
-    """Draws the figures with a number or a name from a run folder; the files equal those of the report byte by byte.
+    """Draws the figures with a number or a name from a run folder, also as PDF.
+
+    PNG and SVG equal those of the report byte by byte.
 
     Args:
         folder: A run folder.
-        key: Number of the figure in the paper, or name of the file.
+        key: Number of the figure in the paper, or name of the file, or ALL_FIGURES.
         out: Folder for the files; None: the working directory.
 
     Returns:
-        The files written: PNG and SVG of each figure.
+        The files written: PNG, SVG and PDF of each figure.
 
     Raises:
         SettingsError: The folder is not a run folder, there is no such figure, the run lacks its data, or a file exists
             already.
     """
-    kinds = catalogue.find(key)
-    if not kinds:
+    kinds, every = catalogue.find(key), key == ALL_FIGURES
+    if not kinds and not every:
         there = ", ".join(map(catalogue.label, catalogue.FIGURES))
         raise SettingsError(f"--figure {key}: no such figure; there are {there}")
     everybody, metrics = _recorded(folder, "--figure")
     run = everybody.of_person(everybody.people[0])
+    kinds = catalogue.select_figures(run, metrics) if every else kinds
     for kind in kinds:
         if why := catalogue.missing(kind, run, metrics):
             raise SettingsError(f"--figure {key}: {folder} lacks what it needs: {why}")
@@ -352,12 +372,12 @@ def draw_figures(folder: Path, key: str, out: Path | None) -> list[Path]:
         for kind in kinds
         for number in (everybody.people if kind.each else everybody.people[:1])
     ]
-    paths = [to / f"{name}.{suffix}" for name in names for suffix in ("png", "svg")]
-    if taken := [path for path in paths if path.exists()]:
+    suffixes = ("png", "svg", "pdf")
+    if taken := [path for name in names for suffix in suffixes if (path := to / f"{name}.{suffix}").exists()]:
         raise SettingsError(f"{taken[0]}: exists already; name another folder with --out, or remove it")
     with tempfile.TemporaryDirectory() as made:
-        drawn = _draw_figures(read_run_config(folder), everybody, metrics, kinds, Path(made))
-        if len(drawn) < len(names):
+        drawn = _draw_figures(read_run_config(folder), everybody, metrics, kinds, Path(made), pdf=True)
+        if len(drawn) < len(names) and not every:
             raise SettingsError(
                 f"--figure {key}: {folder} lacks what it needs: the person was not known well enough then"
             )
@@ -365,6 +385,7 @@ def draw_figures(folder: Path, key: str, out: Path | None) -> list[Path]:
             to.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise SettingsError(f"{to}: cannot be made ({error.strerror}); name another folder with --out") from error
+        paths = [to / f"{name}.{suffix}" for name in names if name in drawn for suffix in suffixes]
         for path in paths:
             run_folder.write_whole(path, (Path(made) / path.name).read_bytes())
     return paths

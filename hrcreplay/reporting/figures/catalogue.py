@@ -360,9 +360,14 @@ def file_name(kind: FigureKind, number: int) -> str:
 
 
 def draw_all(
-    data: FigureData, folder: Path, kinds: Sequence[FigureKind] | None = None, number: int = 1
+    data: FigureData,
+    folder: Path,
+    kinds: Sequence[FigureKind] | None = None,
+    number: int = 1,
+    *,
+    pdf: bool = False,
 ) -> tuple[str, ...]:
-    """Draws figures into ``folder`` as ``<name>.png`` and ``<name>.svg``.
+    """Draws figures into ``folder`` as ``<name>.png`` and ``<name>.svg``, and ``<name>.pdf`` if asked to.
 
     Args:
         data: Input of the figures.
@@ -370,6 +375,7 @@ def draw_all(
         kinds: Figures to draw; None: all for which the run has the data. A figure without its computed data is left
             out.
         number: The person of ``data``.
+        pdf: True: also as PDF.
 
     Returns:
         The names drawn.
@@ -380,7 +386,7 @@ def draw_all(
         if kind.predicted and not getattr(data, kind.predicted):
             continue
         with drawing.style(column=True):
-            drawing.save(kind.draw(data), folder, file_name(kind, number), drawing.COLUMN_DPI)
+            drawing.save(kind.draw(data), folder, file_name(kind, number), drawing.COLUMN_DPI, pdf=pdf)
         names.append(file_name(kind, number))
     return tuple(names)
 

@@ -14,6 +14,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_pdf import FigureCanvasPdf
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
@@ -84,6 +85,7 @@ STYLE: dict[str, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "hrcreplay",
     "svg.image_inline": True,
+    "pdf.fonttype": 42,
 }
 
 #: Settings that differ in one column of a two-column paper.
@@ -255,16 +257,28 @@ def svg_bytes(figure: Figure, dpi: int = DPI) -> bytes:
     return stream.getvalue()
 
 
-def save(figure: Figure, folder: Path, name: str, dpi: int = DPI) -> None:
-    """Writes ``name.svg`` and ``name.png``.
+def pdf_bytes(figure: Figure, dpi: int = DPI) -> bytes:
+    """Returns the figure as PDF with text that can be searched; the same figure gives the same bytes."""
+    stream = io.BytesIO()
+    figure.set_dpi(dpi)  # resolution of bitmaps inside the PDF
+    canvas: Any = FigureCanvasPdf(figure)
+    canvas.print_pdf(stream, metadata={"CreationDate": None, "Creator": None, "Producer": None})
+    return stream.getvalue()
+
+
+def save(figure: Figure, folder: Path, name: str, dpi: int = DPI, *, pdf: bool = False) -> None:
+    """Writes ``name.svg`` and ``name.png``, and ``name.pdf`` if asked to.
 
     Args:
         figure: Figure to write.
         folder: Folder for the files.
         name: Name of the files.
-        dpi: Resolution of the PNG, and of bitmaps in the SVG.
+        dpi: Resolution of the PNG, and of bitmaps in the others.
+        pdf: True: also as PDF, which takes as long as the two others.
     """
     (folder / f"{name}.svg").write_bytes(svg_bytes(figure, dpi))
+    if pdf:
+        (folder / f"{name}.pdf").write_bytes(pdf_bytes(figure, dpi))
     figure.set_facecolor("white")
     (folder / f"{name}.png").write_bytes(png_bytes(figure, dpi))
 

@@ -22,6 +22,7 @@ from hrcreplay.reporting.figures import drawing
 from hrcreplay.reporting.figures.scene import ABOVE, View, bones, bounds_of, draw_solids, view_from, volume_solids
 from hrcreplay.reporting.metrics.planning import numeric_column
 from hrcreplay.reporting.metrics.series import columns, times
+from hrcreplay.reporting.tables import part_name_text
 
 #: Limb -> its volume.
 Limbs = Mapping[str, SweptVolume]
@@ -125,7 +126,11 @@ def sweeps(sweep: Sweep, t0_ns: int) -> Figure:
     ax.set(title="(7) walking, from above", xlabel="x [m]", ylabel="y [m]")
     _draw_turn(turn, sweep)
     figure.text(
-        0.5, 0.2 / 2.35, f"{sweep.limb} {_at(sweep.t_ns, t0_ns).lower()}", ha="center", va="bottom", fontsize=6.5
+        *(0.5, 0.2 / 2.35),
+        f"{part_name_text(sweep.limb)} {_at(sweep.t_ns, t0_ns).lower()}",
+        ha="center",
+        va="bottom",
+        fontsize=6.5,
     )
     handles: list[Line2D | Patch] = [
         Line2D([], [], color=drawing.INK, lw=1.6, label="forearm"),
@@ -194,8 +199,8 @@ def volumes_at(occupancy: pd.DataFrame, people: Sequence[pd.DataFrame], moment_n
     t_ns = int(times(rows)[0])
     shown = [skeleton_at(state, t_ns) for state in people]
     heading = shown[0][1]
-    figure = drawing.column_figure(2.5)
-    (ahead, above), *_ = drawing.column_panels(figure, 1, 2, bottom_in=0.56, gap_in=(0.0, 0.5))
+    figure = drawing.column_figure(2.62)
+    (ahead, above), *_ = drawing.column_panels(figure, 1, 2, bottom_in=0.68, gap_in=(0.0, 0.5))
     solids = volume_solids(limbs)
     for ax, view in ((ahead, view_from(heading - 0.7, 0.15)), (above, ABOVE)):
         low, high = bounds_of([solid.outline(view) for solid in solids], 0.03)
@@ -235,14 +240,14 @@ def volumes(instants: Sequence[Instant], state: pd.DataFrame, t0_ns: int) -> Fig
     left, right = min(low[0] for low, _ in boxes), max(high[0] for _, high in boxes)
     wide_in = (drawing.COLUMN_IN - 0.22) / len(instants)
     tall_in = [max(0.5, float(high[1] - low[1]) * wide_in / float(right - left)) for low, high in boxes]
-    figure = drawing.column_figure(0.56 + sum(tall_in) + 0.06 * (len(methods) - 1))
+    figure = drawing.column_figure(0.68 + sum(tall_in) + 0.06 * (len(methods) - 1))
     grid = drawing.column_panels(
         figure,
         *(len(methods), len(instants)),
         left_in=0.2,
         right_in=0.02,
         top_in=0.34,
-        bottom_in=0.22,
+        bottom_in=0.34,
         gap_in=(0.06, 0.0),
         heights=tall_in,
     )
@@ -283,11 +288,13 @@ def _draw_bones(ax: Axes, points: Floats, view: View, centre: Floats) -> None:
 
 def _limb_legend(figure: Figure, drawn: Mapping[str, object] | set[str]) -> None:
     limbs = {name.partition(OF_PERSON)[0] for name in drawn}
-    handles = [Patch(color=colour, lw=0, label=limb) for limb, colour in drawing.LIMBS.items() if limb in limbs]
+    handles = [
+        Patch(color=colour, lw=0, label=part_name_text(limb)) for limb, colour in drawing.LIMBS.items() if limb in limbs
+    ]
     figure.legend(
         handles=handles,
         loc="lower center",
-        ncols=len(handles),
+        ncols=4,
         bbox_to_anchor=(0.5, 0.03 / figure.get_figheight()),
         handlelength=1.0,
         columnspacing=0.8,

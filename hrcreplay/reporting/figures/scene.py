@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -14,11 +14,12 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.path import Path
 from scipy.spatial import ConvexHull, QhullError
 
 from hrcreplay.geometry.convex_hull import above, hull, visible_front
 from hrcreplay.geometry.small_matrices import apply, multiply
-from hrcreplay.records import FLOOR_Z_M, POINTS, Floats, Ints, SweptVolume
+from hrcreplay.records import FLOOR_Z_M, POINTS, Bools, Floats, Ints, SweptVolume
 from hrcreplay.reporting.figures import drawing
 from hrcreplay.reporting.figures.drawing import figure_in
 from hrcreplay.reporting.metrics.series import thin_path
@@ -36,8 +37,8 @@ class RenderedHull:
 
     @cached_property
     def surface(self) -> tuple[Floats, Ints]:
-        """The hull with coarse balls, in the form of ``hull``; empty if unknown."""
-        return self._grown(_sphere(64 if len(self.vertices_m) <= _FEW else 32))  # mostly hidden inside the polytope
+        """The hull with coarse balls around the true ones, in the form of ``hull``; empty if unknown."""
+        return self._grown(_around_ball(64 if len(self.vertices_m) <= _FEW else 32))  # mostly inside the polytope
 
     def outline(self, view: View) -> Floats:
         """(k, 2) outline in a view, exact except for the 36 corners of circles [m]; empty without a hull."""
@@ -119,10 +120,30 @@ def _sphere(count: int) -> Floats:
     return np.column_stack([np.cos(around) * np.sin(polar), np.sin(around) * np.sin(polar), np.cos(polar)])
 
 
+@lru_cache
+def _around_ball(count: int) -> Floats:
+    """(count, 3) corners of a polytope around the unit ball."""
+    corners = _sphere(count)
+    return np.asarray(corners / -ConvexHull(corners).equations[:, 3].max())
+
+
+def _within(edge: Floats, u: Floats, v: Floats) -> Bools:
+    """(len(v), len(u)) True for the points of a grid inside an outline (k, 2)."""
+    grid = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    return np.asarray(Path(edge).contains_points(grid)).reshape(len(v), len(u))
+
+
 def render_hulls(
-    solids: Sequence[RenderedHull | RenderedSolid], view: View, low: Floats, high: Floats, pixel_m: float
+    solids: Sequence[RenderedHull | RenderedSolid],
+    view: View,
+    low: Floats,
+    high: Floats,
+    pixel_m: float,
+    beyond_m: float = 0.0,
 ) -> Floats:
     """Renders solids that may intersect: each pixel shows the frontmost surface, lit from above.
+
+    A hull with its ball ends at its exact outline.
 
     Args:
         solids: Hulls with their balls and colours.
@@ -130,6 +151,7 @@ def render_hulls(
         low: (2,) lower left corner of the picture in the view [m].
         high: (2,) upper right corner [m].
         pixel_m: Edge of a pixel [m].
+        beyond_m: Distance by which hulls go beyond their outlines, for a picture that is cut there [m].
 
     Returns:
         (rows, columns, 4) colours and opacity in [0, 1], the first row at the bottom.
@@ -152,6 +174,9 @@ def render_hulls(
         columns = slice(*np.searchsorted(u, [low_uv[0], high_uv[0]]))
         depth, light = visible_front(triangles, apply(normals, multiply(sun[None], axes)[0]), u[columns], v[rows])
         ahead = depth > nearest[rows, columns]
+        if isinstance(solid, RenderedHull):
+            edge = replace(solid, radius_m=solid.radius_m + beyond_m).outline(view)
+            ahead &= _within(edge, u[columns], v[rows]) if len(edge) else False
         shade = (0.62 + 0.38 * np.clip(light / np.linalg.norm(sun), 0.0, 1.0))[..., None] * np.asarray(solid.colour)
         nearest[rows, columns][ahead] = depth[ahead]
         image[rows, columns, :3][ahead] = shade[ahead]
@@ -176,11 +201,14 @@ def draw_solids(
         return
     low, high = bounds_of(edges, 0.01)
     window_m, height_in = np.diff(ax.get_ylim())[0], ax.get_position().height * figure_in(ax)[1]
-    image = render_hulls(solids, view, low, high, float(window_m) / (SOLIDS_DPI * height_in))
+    pixel_m = float(window_m) / (SOLIDS_DPI * height_in)
+    image = render_hulls(solids, view, low, high, pixel_m, 2.0 * pixel_m)
     image[..., 3] *= opacity
     limits = ax.get_xlim(), ax.get_ylim()
     extent = (float(low[0]), float(high[0]), float(low[1]), float(high[1]))
-    ax.imshow(image, origin="lower", extent=extent, aspect="auto", interpolation="bilinear", zorder=2)
+    picture = ax.imshow(image, origin="lower", extent=extent, aspect="auto", interpolation="bilinear", zorder=2)
+    closed = [Path(np.vstack([edge, edge[:1]]), closed=True) for edge in edges if len(edge)]
+    picture.set_clip_path(Path.make_compound_path(*closed), ax.transData)  # a border without steps
     ax.set(xlim=limits[0], ylim=limits[1])
     known = [(edge, solid.colour) for solid, edge in zip(solids, edges, strict=True) if len(edge)]
     polygons = PolyCollection([edge for edge, _ in known], facecolors="none", zorder=3)
