@@ -1,11 +1,13 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
+from pypdf import PdfReader
 
 from hrcreplay.records import SweptVolume
 from hrcreplay.reporting.figures import catalogue, planning, prediction
@@ -13,6 +15,7 @@ from hrcreplay.reporting.figures.catalogue import FIGURES, FigureData
 from hrcreplay.reporting.figures.prediction import Growth, Sweep, Walk
 from hrcreplay.reporting.figures.scene import ABOVE, RenderedHull, render_hulls, view_from
 from hrcreplay.reporting.metrics.series import instants
+from hrcreplay.reporting.tables import LIMB_NAMES
 from hrcreplay.store.run_folder import Run
 from tests.facts import tells
 from tests.reporting.moving import moving_run
@@ -69,6 +72,17 @@ def test_the_same_run_draws_the_same_bytes(tmp_path: Path) -> None:
         assert b"Matplotlib" not in first or name.endswith(".png"), name
 
 
+def test_a_pdf_has_the_words_of_its_figure_and_the_same_bytes_each_time(tmp_path: Path) -> None:
+    run, kinds = make_run(5.0), catalogue.find("18")
+    for folder in ("a", "b"):
+        catalogue.draw_all(data_of(run), tmp_path / folder, kinds, pdf=True)
+    first, second = ((tmp_path / folder / "fig18_coordinate.pdf").read_bytes() for folder in ("a", "b"))
+    assert first == second
+    (page,) = PdfReader(io.BytesIO(first)).pages
+    assert tells(" ".join(page.extract_text().split()), "fused", "truth", "kinect", "time [s]")
+    assert float(page.mediabox.width) == pytest.approx(252.0)
+
+
 def test_what_has_no_data_is_not_drawn(tmp_path: Path) -> None:
     run = make_run(4.0, human=False, robot=False)
     assert draw(run, tmp_path, predicted=False) == {"fig18_coordinate", "joint_angles", "data_quality"}
@@ -94,9 +108,9 @@ def test_volumes_show_every_method_and_limb_in_its_own_size() -> None:
     tall = limbs | {"LEGS": SweptVolume(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 9.0]]), 0.5)}
     k = T0_NS + 2_000_000_000
     plain = prediction.volumes([(k, {"paper": limbs})], run.state, T0_NS)
-    assert "LEGS" not in {text.get_text() for text in plain.legends[0].get_texts()}
+    assert "legs" not in {text.get_text() for text in plain.legends[0].get_texts()}
     found = prediction.volumes([(k, {"paper": limbs, "sound": tall})], run.state, T0_NS)
-    assert {text.get_text() for text in found.legends[0].get_texts()} == {*limbs, "LEGS"}
+    assert {text.get_text() for text in found.legends[0].get_texts()} == {LIMB_NAMES[limb] for limb in (*limbs, "LEGS")}
     assert [ax.get_ylabel().split("\n")[0] for ax in found.axes] == ["paper", "sound"]
     low, high = found.axes[1].get_ylim()
     assert high - low > 9.0 * np.cos(0.28)
