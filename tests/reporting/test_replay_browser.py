@@ -273,6 +273,14 @@ def test_two_methods_stand_side_by_side_at_the_same_instant(tab: Tab, scene: Rep
     ends = np.array(tab.evaluate("replay.view.ends.map(pair => pair.map(end => end.toArray()))"))
     model = robot(moving_run(2.0))
     np.testing.assert_allclose(ends, model.ends_m(scene.methods["qp"].q[row]), atol=1e-3)  # the plan is drawn last
+    drawn = tab.evaluate(
+        "(view => { const seen = [], show = view.show, cut = view.renderer.setScissor;"
+        "view.show = (...how) => (seen.push(how[0]), show.apply(view, how));"
+        "view.renderer.setScissor = (...box) => (seen.push(box), cut.apply(view.renderer, box));"
+        "view.render(); view.show = show; view.renderer.setScissor = cut; return seen; })(replay.view)"
+    )
+    assert drawn[0::2] == ["scaling", "qp"]
+    assert [box[0] for box in drawn[1::2]] == pytest.approx([left["width"], 0.0], abs=1.0)
     assert not tab.evaluate("document.querySelector('.readout.other').hidden")
     assert "scaling" in tab.evaluate("document.querySelector('.readout.other').textContent")
     alone = picture(tab)
