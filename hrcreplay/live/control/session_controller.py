@@ -109,8 +109,6 @@ def _reason_of_tracking(measured: Floats, commanded: Floats, bounds: Live) -> st
     return "" if np.abs(measured - commanded).max() <= bounds.tracking_rad else TRACKING
 
 
-_BY_HAND = "it moves once EGM has ended, the robot was moved away by hand, and EGM has started again"
-
 #: Obstacles before the first perception update: nothing is known, so the robot stands.
 _UNSEEN = Obstacles(np.empty((0, 3)), np.zeros(1, np.int64), np.empty(0), np.empty((0, 2, 3)), known=False)
 
@@ -158,7 +156,8 @@ class SessionController:
     def outlook(self) -> str:
         """Condition on which a robot at rest moves again; empty if it moves or if the session ends."""
         if self.phase == codec.WAITING and self.waiting:
-            return _BY_HAND if self.waiting == TOO_NEAR else "it moves as soon as that is over"
+            by_hand = "it moves once EGM has ended, the robot was moved away by hand, and EGM has started again"
+            return by_hand if self.waiting == TOO_NEAR else "it moves as soon as that is over"
         if self.phase != codec.HOLDING or self.stop in (*_ENDINGS, *_FINAL):
             return ""
         if not self.setup.bounds.resume:
