@@ -211,6 +211,51 @@ _stage("predict", "Stages 1, 2: the space the person can reach within the brakin
 _stage("plan", "Stages 1 to 3: what the robot would have done (motion.parquet).")
 
 
+Snapshot = Annotated[
+    float | None,
+    typer.Option(
+        "--snapshot",
+        metavar="SECONDS",
+        help="With a run folder: only write a still of its replay at that instant, PNG; --out names the file.",
+    ),
+]
+Movie = Annotated[
+    bool,
+    typer.Option(
+        "--movie",
+        help="With a run folder: only write ten seconds of its worst moments, MP4 (needs ffmpeg) or GIF; "
+        "--out names the file.",
+    ),
+]
+ForRerun = Annotated[
+    bool,
+    typer.Option(
+        "--rerun",
+        help="With a run folder: only write its scene for the Rerun viewer (extra: rerun); --out names the file.",
+    ),
+]
+Pdf = Annotated[
+    bool,
+    typer.Option(
+        "--pdf",
+        help="With a run folder: only write its safety file, four pages to print and sign; --out names the file.",
+    ),
+]
+Figure = Annotated[
+    str | None,
+    typer.Option(
+        "--figure",
+        metavar="NUMBER",
+        help="With a run folder: only write that figure, such as 14, horizon or all, also as PDF; --out names the "
+        "folder.",
+    ),
+]
+ListFigures = Annotated[
+    bool,
+    typer.Option("--list-figures", help="Only list the figures, and whether a run folder has the data for each."),
+]
+
+
 @app.command()
 def report(
     source: Annotated[
@@ -226,49 +271,12 @@ def report(
     end: End = None,
     smooth: Smooth = False,
     chunk_ticks: Chunk = 250,
-    snapshot: Annotated[
-        float | None,
-        typer.Option(
-            "--snapshot",
-            metavar="SECONDS",
-            help="With a run folder: only write a still of its replay at that instant, PNG; --out names the file.",
-        ),
-    ] = None,
-    movie: Annotated[
-        bool,
-        typer.Option(
-            "--movie",
-            help="With a run folder: only write ten seconds of its worst moments, MP4 (needs ffmpeg) or GIF; "
-            "--out names the file.",
-        ),
-    ] = False,
-    rerun: Annotated[
-        bool,
-        typer.Option(
-            "--rerun",
-            help="With a run folder: only write its scene for the Rerun viewer (extra: rerun); --out names the file.",
-        ),
-    ] = False,
-    pdf: Annotated[
-        bool,
-        typer.Option(
-            "--pdf",
-            help="With a run folder: only write its safety file, four pages to print and sign; --out names the file.",
-        ),
-    ] = False,
-    figure: Annotated[
-        str | None,
-        typer.Option(
-            "--figure",
-            metavar="NUMBER",
-            help="With a run folder: only write that figure, such as 14, horizon or all, also as PDF; --out names the "
-            "folder.",
-        ),
-    ] = None,
-    list_figures: Annotated[
-        bool,
-        typer.Option("--list-figures", help="Only list the figures, and whether a run folder has the data for each."),
-    ] = False,
+    snapshot: Snapshot = None,
+    movie: Movie = False,
+    rerun: ForRerun = False,
+    pdf: Pdf = False,
+    figure: Figure = None,
+    list_figures: ListFigures = False,
 ) -> None:
     """All stages, then metrics.json, figures, report.html with the 3-D replay, and scene.mcap."""
     if list_figures or source is None or figure is not None or snapshot is not None or movie or rerun or pdf:
@@ -302,6 +310,10 @@ def _part_of_report(
     """Writes single parts of a report from a run folder, without a new run folder."""
     from hrcreplay.commands.report import draw_figures, list_figures, make_movie, make_pdf, save_for_rerun, take_still
 
+    parts = {"--figure": figure is not None, "--snapshot": snapshot is not None}
+    parts |= {"--movie": movie, "--rerun": rerun, "--pdf": pdf, "--list-figures": listed}
+    if len(given := [option for option, there in parts.items() if there]) > 1:
+        raise SettingsError(f"report: found {' and '.join(given)}; would be right: one of them at a time")
     if listed:
         found: list[object] = [*list_figures(source)]
     elif source is None:

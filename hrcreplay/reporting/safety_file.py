@@ -91,7 +91,7 @@ class _Paper(FPDF):
         self._letters(6.6, colour=_SOFT)
         self.set_draw_color(*_LINE)
         self.line(_MARGIN_MM, self.get_y() - 1.5, self.w - _MARGIN_MM, self.get_y() - 1.5)
-        self.multi_cell(0, 3.4, f"{CAUTION}\nhrcreplay {self._version}, {self._name}, page {self.page_no()} of {PAGES}")
+        self.multi_cell(0, 3.4, f"{CAUTION}\nhrcreplay {self._version}, {self._name}, page {self.page_no()} of {{nb}}")
 
     def section(self, title: str) -> None:
         """Begins a page."""

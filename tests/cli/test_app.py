@@ -249,6 +249,7 @@ BAD: dict[str, tuple[tuple[object, ...], int, str]] = {
         "--figure 12: no such figure; there are 5, 7, 8, 9, 13a, 13b, 14, 15, 16, 17, 18, horizon, volume_horizon,",
     ),
     "figure of a log": (("report", DEMO, "--figure", "14"), 2, "is no run folder; make one with: hrcreplay report"),
+    "two parts of a report": (("report", DEMO, "--movie", "--pdf"), 2, "report: "),
     "figures of a log": (("report", DEMO, "--list-figures"), 2, "--list-figures: "),
     "nothing to report on": (("report",), 2, "report: found neither log nor run folder; give one"),
     "not a run folder": (("report", "taken"), 3, "taken"),

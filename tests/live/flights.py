@@ -158,6 +158,15 @@ class Flight:
         names = [PHASES[answer.phase] for answer in self.answers]
         return [name for i, name in enumerate(names) if i == 0 or names[i - 1] != name]
 
+    def top_speed(self, begin_s: float, end_s: float) -> float:
+        """The greatest commanded axis speed between two instants [rad/s]."""
+        rows = [
+            answer.row.dq
+            for answer in self.answers
+            if answer.row is not None and begin_s <= (answer.t_ns - BEGIN_NS) * 1e-9 < end_s
+        ]
+        return float(np.abs(rows).max())
+
     def commanded(self) -> tuple[Floats, Floats]:
         """(n, 6) positions [rad] and speed references [rad/s] of all replies."""
         said = self.said()

@@ -35,16 +35,6 @@ def comes(s: float) -> tuple[float, float] | None:
     return None if s < 2.0 else (max(0.75, 3.0 - 1.2 * (s - 2.0)), 0.5)
 
 
-def speeds(flight: Flight, begin_s: float, end_s: float) -> float:
-    """The greatest commanded axis speed between two instants [rad/s]."""
-    rows = [
-        answer.row.dq
-        for answer in flight.answers
-        if answer.row is not None and begin_s <= (answer.t_ns - BEGIN_NS) * 1e-9 < end_s
-    ]
-    return float(np.abs(rows).max())
-
-
 @pytest.fixture(scope="module")
 def flight() -> Flight:
     return Flight((FAST,), stands, second=comes).fly(7.0)
@@ -63,8 +53,8 @@ def stored(flight: Flight, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_robot_keeps_clear_of_whoever_is_nearest(flight: Flight) -> None:
     assert not flight.controller.stops
-    assert speeds(flight, 1.0, 2.0) > 0.3
-    assert speeds(flight, 6.0, 7.0) < 0.05  # the second person stands at the robot, the first is far away
+    assert flight.top_speed(1.0, 2.0) > 0.3
+    assert flight.top_speed(6.0, 7.0) < 0.05  # the second person stands at the robot, the first is far away
     names = flight.start["neighbours"], flight.start["limbs"]
     last = volume_name(flight.answers[-1].limb, *names)
     assert last.endswith("of person 2")
@@ -78,7 +68,7 @@ def test_the_robot_keeps_clear_of_whoever_is_nearest(flight: Flight) -> None:
 def test_with_the_nearest_only_the_second_person_is_not_seen() -> None:
     flight = Flight((FAST, "logs.people=nearest"), stands, second=comes).fly(6.0)
     assert {len(states) for states in flight.states} == {1}
-    assert speeds(flight, 5.0, 6.0) > 0.3
+    assert flight.top_speed(5.0, 6.0) > 0.3
     assert flight.controller.counts()["person_frames_beside_others"]
 
 
@@ -145,8 +135,8 @@ def test_the_number_of_a_person_is_compared(flight: Flight, tmp_path: Path) -> N
 def test_somebody_who_is_lost_beside_another_stops_the_session() -> None:
     flight = Flight((FAST,), stands, second=lambda s: None if s > 3.0 else (2.4, 1.0)).fly(5.0)
     assert [reason for _, reason in flight.controller.stops] == [session_controller.NO_FRAME]
-    assert speeds(flight, 1.0, 3.0) > 0.3
-    assert speeds(flight, 4.5, 5.0) == 0.0
+    assert flight.top_speed(1.0, 3.0) > 0.3
+    assert flight.top_speed(4.5, 5.0) == 0.0
     assert PHASES[flight.answers[-1].phase] == "holding"
 
 
@@ -160,4 +150,4 @@ def test_in_a_watched_cell_people_come_and_go(tmp_path: Path) -> None:
     flight = Flight((FAST,), lambda _s: (3.2, -1.0), second=passes, cell=cell).fly(12.0)
     assert not flight.controller.stops
     assert {len(states) for states in flight.states} == {1, 2}
-    assert speeds(flight, 10.5, 12.0) > 0.3
+    assert flight.top_speed(10.5, 12.0) > 0.3

@@ -31,22 +31,12 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return cell_around(tmp_path_factory.mktemp("cell") / "cell.toml", HALF_M)
 
 
-def speeds(flight: Flight, begin_s: float, end_s: float) -> float:
-    """The greatest commanded axis speed between two instants [rad/s]."""
-    rows = [
-        answer.row.dq
-        for answer in flight.answers
-        if answer.row is not None and begin_s <= (answer.t_ns - BEGIN_NS) * 1e-9 < end_s
-    ]
-    return float(np.abs(rows).max())
-
-
 def test_nobody_is_needed_where_nobody_can_be(cell: Path) -> None:
     flight = Flight((FAST,), lambda _s: None, cell=cell).fly(8.0)
     assert flight.phases()[-1] == "following"
     assert not flight.controller.stops
-    assert speeds(flight, 0.0, 2.0) == 0.0  # watched.clear_s
-    assert speeds(flight, 2.0, 8.0) > 0.3
+    assert flight.top_speed(0.0, 2.0) == 0.0  # watched.clear_s
+    assert flight.top_speed(2.0, 8.0) > 0.3
     assert {answer.row.certified for answer in flight.answers if answer.row is not None} == {True}
     assert {flight.start["neighbours"][answer.limb] for answer in flight.answers if answer.limb >= 0} == {BORDER}
     steps_keep_the_limits(flight)
@@ -65,9 +55,9 @@ def test_somebody_who_walks_in_and_out_holds_the_robot_up_and_no_more(cell: Path
 
     flight = Flight((FAST,), walk, cell=cell).fly(13.0)
     assert not flight.controller.stops
-    assert speeds(flight, 2.0, 4.0) > 0.3
-    assert speeds(flight, 6.0, 7.0) < 1e-3
-    assert speeds(flight, 11.0, 13.0) > 0.3
+    assert flight.top_speed(2.0, 4.0) > 0.3
+    assert flight.top_speed(6.0, 7.0) < 1e-3
+    assert flight.top_speed(11.0, 13.0) > 0.3
     assert {answer.row.certified for answer in flight.answers if answer.row is not None} == {True}
     steps_keep_the_limits(flight)
 
@@ -75,22 +65,22 @@ def test_somebody_who_walks_in_and_out_holds_the_robot_up_and_no_more(cell: Path
 def test_cameras_that_fall_silent_stop_the_session(cell: Path) -> None:
     flight = Flight((FAST,), lambda _s: None, cell=cell, silent=lambda s: s > 4.0).fly(6.0)
     assert [reason for _, reason in flight.controller.stops] == [session_controller.NO_FRAME]
-    assert speeds(flight, 2.0, 4.0) > 0.3
-    assert speeds(flight, 5.0, 6.0) == 0.0
+    assert flight.top_speed(2.0, 4.0) > 0.3
+    assert flight.top_speed(5.0, 6.0) == 0.0
     assert PHASES[flight.answers[-1].phase] == "holding"
 
 
 def test_somebody_lost_in_the_middle_stops_the_session(cell: Path) -> None:
     flight = Flight((FAST,), lambda s: None if s > 4.0 else (1.6, 1.2), cell=cell).fly(7.5)
     assert [reason for _, reason in flight.controller.stops] == [session_controller.NO_FRAME]
-    assert speeds(flight, 5.0, 7.5) == 0.0
+    assert flight.top_speed(5.0, 7.5) == 0.0
 
 
 def test_a_body_that_is_named_and_not_shown_keeps_the_area_from_being_vacant(cell: Path) -> None:
     flight = Flight((FAST,), lambda _s: None, cell=cell, named=lambda s: s > 4.0).fly(7.5)
     assert flight.phases()[-1] == "holding"
-    assert speeds(flight, 2.0, 4.0) > 0.3
-    assert speeds(flight, 5.5, 7.5) == 0.0
+    assert flight.top_speed(2.0, 4.0) > 0.3
+    assert flight.top_speed(5.5, 7.5) == 0.0
 
 
 def test_without_a_word_of_the_cell_a_body_without_a_point_is_as_if_it_was_not_sent() -> None:
@@ -105,8 +95,8 @@ def test_with_resume_the_robot_goes_on_once_the_area_is_vacant(cell: Path) -> No
     settings = (FAST, "live.resume=true", "live.resume_s=0.5")
     flight = Flight(settings, lambda s: None if s > 4.0 else (1.6, 1.2), cell=cell).fly(9.0)
     assert [reason for _, reason in flight.controller.stops] == [session_controller.NO_FRAME]
-    assert speeds(flight, 5.0, 6.0) == 0.0
-    assert speeds(flight, 7.0, 9.0) > 0.1
+    assert flight.top_speed(5.0, 6.0) == 0.0
+    assert flight.top_speed(7.0, 9.0) > 0.1
 
 
 def test_looks_at_the_area_are_the_replay_tick_by_tick(cell: Path) -> None:
@@ -139,7 +129,7 @@ def test_a_session_in_a_watched_cell_comes_out_the_same_again(cell: Path, tmp_pa
         return None if s < 3.0 else (max(1.2, 3.2 - 1.2 * (s - 3.0)), 0.2)
 
     flight = Flight((FAST, f"plan.method={method}"), walk, cell=cell).fly(5.0)
-    assert speeds(flight, 2.0, 4.0) > 0.2
+    assert flight.top_speed(2.0, 4.0) > 0.2
     partial = folder.make_partial(tmp_path / "session")
     end = {"what": "end", "reason": "Ctrl-C", "counts": {}, "dropped": 0, "looks_skipped": 0, "stops": []}
     start = codec.encode_event(BEGIN_NS - 1, {"what": "start", **flight.start})
