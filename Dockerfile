@@ -1,6 +1,6 @@
 # hrcreplay on the command line, for a machine without Python 3.11 to 3.13. Building it needs a network, running it does not:
 #   docker build -t hrcreplay .                                       (podman build -t hrcreplay . likewise)
-#   docker run --rm -v "$PWD:/work" --user "$(id -u):$(id -g)" hrcreplay report session.mcap --cell cell.toml
+#   docker run --rm -v "$PWD:/data" --user "$(id -u):$(id -g)" hrcreplay report session.mcap --cell cell.toml
 FROM python:3.13-slim AS wheel
 WORKDIR /source
 COPY . .
@@ -13,7 +13,7 @@ COPY --from=wheel /wheel /wheel
 RUN pip install --no-cache-dir --only-binary :all: -c /wheel/versions.txt /wheel/*.whl
 # The kernels are compiled once, for the processor of the build; another processor compiles its own at the first run.
 ENV NUMBA_CACHE_DIR=/kernels MPLCONFIGDIR=/tmp PYTHONDONTWRITEBYTECODE=1
-RUN mkdir /kernels /work && cd /tmp && python -c "import hrcreplay.commands.replay as r; print(r.demo_log())" > log \
+RUN mkdir /kernels /data && cd /tmp && python -c "import hrcreplay.commands.replay as r; print(r.demo_log())" > log \
     && hrcreplay report "$(cat log)" --start 8 --end 11 --out first-run && rm -r first-run log && chmod -R a+rwX /kernels
-WORKDIR /work
+WORKDIR /data
 ENTRYPOINT ["hrcreplay"]
