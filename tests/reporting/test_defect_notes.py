@@ -33,7 +33,7 @@ def test_a_clean_log_has_no_flaws() -> None:
 def test_the_first_screen_tells_what_was_wrong_and_only_then(tmp_path: Path) -> None:
     run = dataclasses.replace(make_run(2.0), counts={"chunks_unreadable": 2, "frames_kinect": 60})
     html = rendered(run, tmp_path)
-    first = page_lines(html[: html.index("<nav>")])
+    first = page_lines(html[: html.index("<main>")])
     assert f"{DEFECTS['chunks_unreadable']}: 2" in first
     assert run.notes[0] in first
     assert not tells(first, "60")  # delivered rows are no defect

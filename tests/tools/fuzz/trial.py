@@ -21,6 +21,7 @@ from unittest import mock
 import numpy as np
 import pyarrow.parquet as pq
 
+import hrcreplay
 from hrcreplay.cli import app
 from hrcreplay.live import session
 from hrcreplay.records import JOINTS
@@ -29,6 +30,7 @@ from tests.live.sessions import PATIENT, children
 from tests.tools.fuzz.clip import CAMERAS, Clip, write
 from tests.tools.fuzz.spoil import spoilt
 
+PACKAGE = Path(hrcreplay.__file__).parent
 OFFLINE = ("fuse", "audit", "report")
 LIVE = "live"
 
@@ -160,7 +162,7 @@ def _judge(found: Trial, made: Clip, out: Path) -> None:
 def _last(err: str) -> str:
     """The exception, and where in our code it arose."""
     lines = err.rstrip().splitlines()
-    places = re.findall(r'hrcreplay/(\S+\.py)", line (\d+)', err)
+    places = re.findall(rf'"{re.escape(str(PACKAGE))}/(\S+\.py)", line (\d+)', err)
     where = "{}:{}".format(*places[-1]) if places else "?"
     return f"traceback: {lines[-1]} ({where})"
 
