@@ -58,10 +58,7 @@ def distances(ends: Floats, vertices: Floats, offsets: Ints) -> tuple[Floats, Fl
     links, limbs = len(ends), len(offsets) - 1
     low, high = np.empty((links, limbs)), np.empty((links, limbs))
     near = np.empty((links, limbs, MOST), dtype=np.int64)
-    square = np.empty((MOST - 1, MOST - 1))
-    work = Carriers(
-        np.empty((MOST, 3)), np.empty(MOST), np.empty(MOST), np.empty((MOST - 1, 3)), square, np.empty(MOST, np.int64)
-    )
+    work = carriers()
     for s in range(links):
         for k in range(limbs):
             start = near[s - 1, k, 0] if s else offsets[k]  # the previous link is usually near this one
@@ -211,25 +208,50 @@ def separating_planes(ends: Floats, vertices: Floats, offsets: Ints, wanted: Boo
     """
     links, hulls = len(ends), len(offsets) - 1
     low, normals = np.full((links, hulls), np.inf), np.zeros((links, hulls, 3))
-    square = np.empty((MOST - 1, MOST - 1))
-    work = Carriers(
-        np.empty((MOST, 3)), np.empty(MOST), np.empty(MOST), np.empty((MOST - 1, 3)), square, np.empty(MOST, np.int64)
-    )
-    x = np.empty(3)
+    work = carriers()
     for s in range(links):
         for k in range(hulls):
-            if not wanted[s, k]:
-                continue
-            low[s, k], _, count = _distance(ends[s], vertices, offsets[k], offsets[k + 1], offsets[k], work)
-            x[:] = 0.0
-            for i in range(count):
-                for c in range(3):
-                    x[c] += work.weights[i] * work.points[i, c]
-            length = math.sqrt(dot3(x, x))
-            if low[s, k] > 0.0 and length > 0.0:
-                for c in range(3):
-                    normals[s, k, c] = x[c] / length
+            if wanted[s, k]:
+                low[s, k], _ = separating_plane(ends[s], vertices, offsets[k], offsets[k + 1], work, normals[s, k])
     return low, normals
+
+
+@njit(cache=True)
+def carriers() -> Carriers:
+    """Memory of the kernels."""
+    square = np.empty((MOST - 1, MOST - 1))
+    return Carriers(
+        np.empty((MOST, 3)), np.empty(MOST), np.empty(MOST), np.empty((MOST - 1, 3)), square, np.empty(MOST, np.int64)
+    )
+
+
+@njit(cache=True)
+def separating_plane(
+    ends: Floats, vertices: Floats, first: int, last: int, work: Carriers, normal: Floats
+) -> tuple[float, float]:
+    """Computes the plane between a segment and a hull, orthogonal to the shortest way between them.
+
+    Args:
+        ends: (2, 3) ends of the segment [m].
+        vertices: (m, 3) of which the rows ``first`` to ``last`` - 1 span the hull [m].
+        first: First vertex of the hull.
+        last: Vertex after the last one.
+        work: From ``carriers``.
+        normal: (3,) receives the unit vector from segment to hull; unchanged in penetration.
+
+    Returns:
+        Lower and upper bound of the distance [m]; see ``distances``.
+    """
+    low, high, count = _distance(ends, vertices, first, last, first, work)
+    x0, x1, x2 = 0.0, 0.0, 0.0
+    for i in range(count):
+        x0 += work.weights[i] * work.points[i, 0]
+        x1 += work.weights[i] * work.points[i, 1]
+        x2 += work.weights[i] * work.points[i, 2]
+    length = math.sqrt(x0 * x0 + x1 * x1 + x2 * x2)
+    if low > 0.0 and length > 0.0:
+        normal[0], normal[1], normal[2] = x0 / length, x1 / length, x2 / length
+    return low, high
 
 
 def protrusion_m(axes: Floats, radius_m: float, vertices: Floats, ball_m: float) -> Floats:

@@ -57,6 +57,12 @@ def norm_n(v: Floats) -> float:
     return math.sqrt(dot_n(v, v))
 
 
+def speed_of(twist: Floats) -> float:
+    """Length of the first three elements of a twist (6,) as ``norm_n`` gives it, without the call of a kernel."""
+    x, y, z, *_ = twist.tolist()
+    return math.sqrt(x * x + y * y + z * z)
+
+
 @njit(cache=True)
 def to_vector(R: Floats) -> Floats:
     """(3,) rotation vector of (3, 3), its length in [0, pi] [rad]; exact near both ends.

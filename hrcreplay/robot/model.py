@@ -10,37 +10,22 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
 from hrcreplay.errors import SettingsError
-from hrcreplay.geometry.small_matrices import apply, multiply
 from hrcreplay.geometry.vectors import dot_n, norm_n
-from hrcreplay.kernels import njit
 from hrcreplay.records import AxisFrame, Bools, Floats, Ints
 from hrcreplay.robot import irb140 as irb140_data
+from hrcreplay.robot.kinematics import Arm, Chain, RobotPose, axis_frames, ends_at, motion_of_links, pose_at
 from hrcreplay.robot.link_capsules import Extent, Segment, Vector, capsules, distance_m
 from hrcreplay.robot.urdf import Description, describe, own_extent, unreadable, with_shapes
 from hrcreplay.settings.sections import Robot
 
 __all__ = ["RobotModel", "RobotPose", "Segment", "from_urdf", "irb140"]
-
-
-@dataclass(frozen=True, slots=True)
-class RobotPose:
-    """Kinematics that the controller needs at one instant, world frame. Rows of twists: linear, then angular."""
-
-    T_world_tcp: Floats  #: (4, 4)
-    J_tcp: Floats  #: (6, nv) velocity of the TCP's origin and angular velocity [m/rad, rad/rad]
-    dJdq_tcp: Floats  # noqa: N815  #: (6,) acceleration of the TCP at zero joint acceleration [m/s^2, rad/s^2]
-    ends_m: Floats  #: (s, 2, 3) ends of the segments [m]
-    J_ends: Floats  #: (s, 2, 3, nv) their position Jacobians [m/rad]
-
-    def tcp_speed(self, dq: Floats) -> float:
-        """Speed of the TCP at joint velocities (nv,) [rad/s] [m/s]."""
-        return norm_n(apply(self.J_tcp[:3], dq))
 
 
 class LinkMotion(NamedTuple):
@@ -62,10 +47,7 @@ _TOOL_RADIUS_M = 0.05  # radius of the capsule that the remark proposes; fits a 
 
 @dataclass(frozen=True)
 class RobotModel:
-    """A serial robot on its base. Arrays are (nv,) [rad] and derivatives; an endless axis has infinite ``q_max``.
-
-    ``pose`` writes to buffers of the model, so only one thread at a time may call it.
-    """
+    """A serial robot on its base. Arrays are (nv,) [rad] and derivatives; an endless axis has infinite ``q_max``."""
 
     name: str
     joint_names: tuple[str, ...]
@@ -86,12 +68,21 @@ class RobotModel:
     tcp_outside_m: float  #: distance from the TCP to the capsules of the last link; 0 inside one, NaN without one [m]
     moves: Bools  #: (s, nv) axes that move each segment
     axis_reach_m: Floats  #: (nv, s) upper bound of the distance from an axis of rotation to a segment's axis [m]
-    _kinematics: _Kinematics = field(repr=False, compare=False)
+    chain: Chain = field(repr=False, compare=False)  #: axes, TCP, and both ends of each segment
+    turns: Floats = field(repr=False, compare=False)  #: (s, 3, 3) rotations from the segments' bodies to their axes
+    _inertia: _Inertia = field(repr=False, compare=False)
 
     @property
     def nv(self) -> int:
         """Number of axes."""
         return len(self.joint_names)
+
+    @cached_property
+    def arm(self) -> Arm:
+        """The robot as numbers for kernels."""
+        radius_m = np.array([segment.radius_m for segment in self.segments], dtype=float)
+        limits = self.q_min, self.q_max, self.dq_max, self.ddq_max
+        return Arm(self.chain, radius_m, self.axis_reach_m, *limits)
 
     @property
     def unguarded_tool(self) -> str | None:
@@ -115,25 +106,27 @@ class RobotModel:
             q: (nv,) [rad].
             dq: (nv,) [rad/s].
         """
-        return self._kinematics.pose(q, dq)
+        return pose_at(self.chain, _writable(q), _writable(dq))
 
     def ends_m(self, q: Floats) -> Floats:
         """(s, 2, 3) ends of the segments in the world [m], for joint positions (nv,) [rad]."""
-        return self._kinematics.ends_m(q)
+        return ends_at(self.chain, _writable(q))
 
     def R_bodies(self, q: Floats) -> Floats:
         """(s, 3, 3) rotations from the segments' bodies to the world, for joint positions (nv,) [rad]."""
-        return self._kinematics.R_bodies(q)
+        frames, carriers = axis_frames(self.chain, _writable(q)), self.chain.carriers[::2]
+        turned = frames[carriers, :, :3] @ self.turns
+        return np.where((carriers < 0)[:, None, None], self.turns, turned)
 
     @property
     def inertial(self) -> bool:
         """Whether every axis of the URDF moves a mass; without, the robot's inertia is not known."""
-        return self._kinematics.inertial
+        return self._inertia.inertial
 
     @property
     def moving_mass_kg(self) -> float:
         """Mass of everything that the axes move, by the inertias of the URDF; NaN without them [kg]."""
-        return self._kinematics.moving_mass_kg if self.inertial else math.nan
+        return self._inertia.moving_mass_kg if self.inertial else math.nan
 
     def effective_mass_kg(
         self, q: Floats, link: int, point_m: Floats, normal: Floats, payload_kg: float = 0.0
@@ -154,7 +147,7 @@ class RobotModel:
         """
         if not self.inertial:
             return math.nan
-        gives_way = self._kinematics.mobility(q, link, (point_m, normal), payload_kg)
+        gives_way = self._inertia.mobility(q, link, (point_m, normal), payload_kg)
         return 1.0 / gives_way if gives_way > 0.0 else math.inf
 
     def link_motion(self, q: Floats, dq: Floats) -> LinkMotion:
@@ -164,38 +157,17 @@ class RobotModel:
             q: (n, nv) [rad].
             dq: (n, nv) [rad/s].
         """
-        return self._kinematics.link_motion(np.ascontiguousarray(q), np.ascontiguousarray(dq))
+        return LinkMotion(*motion_of_links(self.chain, _writable(q), _writable(dq)))
 
 
-class _Kinematics:
-    """pinocchio's model and data, and views into the data."""
+class _Inertia:
+    """pinocchio's model and data, for masses."""
 
     def __init__(self, model: Any, points: Sequence[int], tcp: int) -> None:
         self._model, self._data = model, model.createData()
         self._J = self._data.J.reshape(6, model.nv)  # pinocchio gives (6,) when nv == 1
-        self._dJ = self._data.dJ.reshape(6, model.nv)
-        self._points = tuple(self._data.oMf[frame].translation for frame in points)
-        self._turns = tuple(self._data.oMf[frame].rotation for frame in points[::2])
-        self._tcp = self._data.oMf[tcp].rotation, self._data.oMf[tcp].translation
+        self._tcp = self._data.oMf[tcp].translation
         self._moves = np.array([_support(model, frame) for frame in points]).reshape(len(points), model.nv)
-
-    def pose(self, q: Floats, dq: Floats) -> RobotPose:
-        pin.computeJointJacobiansTimeVariation(self._model, self._data, q, dq)
-        pin.updateFramePlacements(self._model, self._data)
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = self._tcp
-        points = np.array(self._points).reshape(-1, 3)
-        J_tcp, dJdq, J_points = _jacobians(self._J, self._dJ, dq, T[:3, 3].copy(), points, self._moves)
-        shape = (len(points) // 2, 2, 3)
-        return RobotPose(T, J_tcp, dJdq, points.reshape(shape), J_points.reshape((*shape, self._model.nv)))
-
-    def ends_m(self, q: Floats) -> Floats:
-        pin.framesForwardKinematics(self._model, self._data, q)
-        return np.array(self._points).reshape(-1, 2, 3)
-
-    def R_bodies(self, q: Floats) -> Floats:
-        pin.framesForwardKinematics(self._model, self._data, q)
-        return np.array(self._turns).reshape(-1, 3, 3)
 
     @property
     def inertial(self) -> bool:
@@ -219,51 +191,11 @@ class _Kinematics:
         M = M + np.triu(M, 1).T
         pin.computeJointJacobians(self._model, self._data, q)
         pin.updateFramePlacements(self._model, self._data)
-        J_tcp = self._J[:3] + np.cross(self._J[3:], self._tcp[1], axis=0)
+        J_tcp = self._J[:3] + np.cross(self._J[3:], self._tcp, axis=0)
         M += payload_kg * J_tcp.T @ J_tcp
         J = (self._J[:3] + np.cross(self._J[3:], point, axis=0)) * self._moves[2 * link]
         along = normal @ J
         return float(along @ np.linalg.solve(M, along))
-
-    def link_motion(self, q: Floats, dq: Floats) -> LinkMotion:
-        moves = self._moves[::2].astype(float)
-        ends, twists = np.empty((len(q), len(moves), 2, 3)), np.empty((len(q), len(moves), 6))
-        for i in range(len(q)):
-            pin.computeJointJacobians(self._model, self._data, q[i])
-            pin.updateFramePlacements(self._model, self._data)
-            ends[i] = np.array(self._points).reshape(-1, 2, 3)
-            twists[i] = multiply(moves * dq[i], self._J.T)
-        return LinkMotion(ends, twists)
-
-
-@njit(cache=True)
-def _jacobians(
-    J: Floats, dJ: Floats, dq: Floats, tcp: Floats, points: Floats, moves: Bools
-) -> tuple[Floats, Floats, Floats]:
-    """Jacobians at points of the world, from pinocchio's Jacobians, which refer to the world's origin."""
-    nv = J.shape[1]
-    J_points = np.zeros((len(points), 3, nv))
-    for i in range(len(points)):
-        for j in range(nv):
-            if moves[i, j]:
-                J_points[i, :, j] = J[:3, j] + _cross(J[3:, j], points[i])
-    J_tcp = np.empty((6, nv))
-    twist = np.zeros(6)
-    dJdq = np.zeros(6)
-    for j in range(nv):
-        J_tcp[:3, j] = J[:3, j] + _cross(J[3:, j], tcp)
-        J_tcp[3:, j] = J[3:, j]
-        twist += J_tcp[:, j] * dq[j]
-        dJdq += dJ[:, j] * dq[j]
-    # Jdot dq of Eq. (66b), (66c): acceleration of the TCP from the spatial acceleration,
-    # d/dt (v_O + w x p) = a_O + dw x p + w x v_p
-    dJdq[:3] += _cross(dJdq[3:], tcp) + _cross(twist[3:], twist[:3])
-    return J_tcp, dJdq, J_points
-
-
-@njit(cache=True)
-def _cross(a: Floats, b: Floats) -> Floats:
-    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
 def irb140(
@@ -358,7 +290,9 @@ def from_urdf(
         tcp_outside_m=_outside(model, segments, points, tcp),
         moves=np.array([_support(model, point) for point in points[::2]]).reshape(-1, model.nv),
         axis_reach_m=_axis_reach_m(model, points),
-        _kinematics=_Kinematics(model, points, tcp),
+        chain=_serial(model, points, tcp),
+        turns=np.array([_carried(model, point).rotation for point in points[::2]]).reshape(-1, 3, 3),
+        _inertia=_Inertia(model, points, tcp),
     )
 
 
@@ -448,6 +382,51 @@ def _body(model: Any, body: str, where: str) -> Any:
     if body not in known:
         raise SettingsError(f"{where}: the robot has no link {body!r}; it has {', '.join(sorted(known))}")
     return model.frames[known[body]]
+
+
+def _serial(model: Any, points: Sequence[int], tcp: int) -> Chain:
+    """The chain for the kernels: each axis is the z axis of its frame."""
+    if list(model.parents)[1:] != list(range(model.nv)):
+        raise SettingsError(f"robot: the axes {', '.join(list(model.names)[1:])} do not follow one another")
+    frames, before = np.empty((model.nv, 3, 4)), np.eye(3)
+    for joint in range(1, model.njoints):
+        placement, onto = model.jointPlacements[joint], _onto_axis(model, joint)
+        frames[joint - 1, :, :3] = before.T @ placement.rotation @ onto
+        frames[joint - 1, :, 3], before = before.T @ placement.translation, onto
+    carried = [_carried(model, point) for point in points]
+    hand = _carried(model, tcp)
+    return Chain(
+        frames=frames,
+        tcp=np.column_stack((hand.rotation, hand.translation)),
+        points_m=np.array([at.translation for at in carried]).reshape(-1, 3),
+        carriers=np.array([model.frames[point].parentJoint - 1 for point in points], dtype=np.int64),
+    )
+
+
+def _onto_axis(model: Any, joint: int) -> Floats:
+    """(3, 3) rotation from a frame whose z axis is the axis of a joint to the joint's own frame."""
+    data = model.createData()
+    pin.computeJointJacobians(model, data, pin.neutral(model))
+    z = np.array(data.oMi[joint].actInv(pin.Motion(data.J.reshape(6, model.nv)[:, joint - 1])).angular)
+    most = int(np.argmax(np.abs(z)))
+    x = np.eye(3)[(most + 1) % 3]
+    x = x - z * dot_n(z, x)
+    x /= norm_n(x)
+    return np.column_stack((x, np.cross(z, x), z))
+
+
+def _carried(model: Any, frame: int) -> Any:
+    """Placement of a frame in the frame of its axis, whose z axis is the axis; in the world if no axis moves it."""
+    one = model.frames[frame]
+    if one.parentJoint == 0:
+        return one.placement
+    return pin.SE3(_onto_axis(model, one.parentJoint).T, np.zeros(3)) * one.placement
+
+
+def _writable(array: Floats) -> Floats:
+    """The array, or a copy of it where numba would compile its kernels again: read-only or not contiguous."""
+    flags = array.flags
+    return array if flags.writeable and flags.c_contiguous else np.array(array, dtype=np.float64, order="C")
 
 
 def _reach_m(model: Any, tcp: int) -> float:

@@ -186,7 +186,7 @@ def _excess(model: RobotModel, track: JointTrajectory, pace: Pace) -> tuple[floa
     way, first, last = np.diff(track.q, axis=0) / pace.step_s, track.dq[:-1], track.dq[1:]
     speeds = np.concatenate([track.dq, 1.5 * way - 0.25 * (first + last)])  # extremes of the cubics between grid points
     accelerations = np.concatenate([6 * way - 4 * first - 2 * last, 2 * first + 4 * last - 6 * way]) / pace.step_s
-    tcp = [model.pose(q, dq).tcp_speed(dq) for q, dq in zip(track.q, track.dq, strict=True)]
+    tcp = [model.pose(q, dq).tcp_speed for q, dq in zip(track.q, track.dq, strict=True)]
     return (
         max(float((np.abs(speeds) / pace.dq_max).max()), max(tcp) / pace.tcp_speed),
         float((np.abs(accelerations) / pace.ddq_max).max()),
@@ -282,7 +282,7 @@ def smooth_recorded(t_ns: Ints, q: Floats, model: RobotModel) -> Reference:
         else np.gradient(even, STEP_S, axis=0)
     )
     _check(model, grid * 1e9, dq, "speed", "rad/s", (-model.dq_max, model.dq_max, _NOISE_SPEED * model.dq_max))
-    fastest = max(float(model.pose(*row).tcp_speed(row[1])) for row in zip(smooth, dq, strict=True))
+    fastest = max(float(model.pose(*row).tcp_speed) for row in zip(smooth, dq, strict=True))
     return _by_itself(model, smooth, dq, (), fastest)
 
 
@@ -339,7 +339,7 @@ def approach(model: RobotModel, start: Floats, goal: Floats, speed: float) -> Re
     share, rate = r * r * r * (10 - 15 * r + 6 * r**2), 30 * r**2 * (1 - r) ** 2 / (end * STEP_S)
     q, dq = start + np.outer(share, way), np.outer(rate, way)
     stations = (start + s * way for s in np.linspace(0.0, 1.0, _STATIONS))  # few points, because a live robot waits
-    fastest = float(rate.max()) * max(model.pose(station, way).tcp_speed(way) for station in stations)
+    fastest = float(rate.max()) * max(model.pose(station, way).tcp_speed for station in stations)
     return _by_itself(model, q, dq, (end * STEP_S,), fastest)
 
 

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
@@ -24,9 +25,10 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
 from hrcreplay.geometry import small_matrices
 from hrcreplay.geometry.small_matrices import apply, multiply
-from hrcreplay.geometry.vectors import dot_n, norm_n, turn_between
+from hrcreplay.geometry.vectors import dot_n, norm_n, speed_of, turn_between
 from hrcreplay.kernels import njit
 from hrcreplay.records import Floats
+from hrcreplay.robot.kinematics import Chain, axis_frames, tcp_jacobian
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.settings.sections import Plan
 from hrcreplay.toml_file import validate
@@ -233,8 +235,7 @@ STEP_S = 0.004
 _ON_GRID = 1e-6
 
 
-@dataclass(frozen=True, slots=True)
-class ReferencePoint:
+class ReferencePoint(NamedTuple):
     """The reference at one instant, world frame."""
 
     q: Floats  #: (nv,) [rad]
@@ -246,16 +247,18 @@ class ReferencePoint:
     @property
     def tcp_speed(self) -> float:
         """Speed of the TCP [m/s]."""
-        return norm_n(self.twist[:3])
+        return speed_of(self.twist)
 
 
 class Grid(NamedTuple):
-    """A path on the time grid; see ``Reference``."""
+    """A path on the time grid without the robot, for kernels; see ``Reference``."""
 
     q: Floats  #: (n, nv) [rad]
     dq: Floats  #: (n, nv) [rad/s]
     end: int  #: grid point of the last waypoint
     duration_s: float  #: from the start to the end of the last cycle [s]
+    waypoints_s: Floats  #: (w,) arrival at each waypoint of the first cycle [s]
+    tcp_speed_max: Floats  #: (n,) limit at each grid point [m/s]
 
 
 @dataclass(frozen=True)
@@ -288,28 +291,22 @@ class Reference:
         """Time from the start to the end of the last cycle; inf if the task repeats [s]."""
         return (self.cycles - 1) * self.cycle_s + self.end * STEP_S
 
-    @property
+    @cached_property
     def grid(self) -> Grid:
-        """The path without the robot, for kernels."""
-        return Grid(self.q, self.dq, self.end, self.duration_s)
+        """The path for kernels."""
+        waypoints_s = np.array(self.waypoints_s, dtype=float)
+        return Grid(self.q, self.dq, self.end, float(self.duration_s), waypoints_s, self.tcp_speed_max)
 
     def next_waypoint(self, s_s: float) -> float:
         """Programmed time of the next arrival at a waypoint, at or after ``s_s``; inf after the last one [s]."""
-        if not self.waypoints_s or s_s > self.duration_s:
-            return math.inf
-        cycle = math.floor(s_s / self.cycle_s)
-        arrivals = (n * self.cycle_s + at_s for n in (cycle, cycle + 1) for at_s in self.waypoints_s)
-        return next((arrival for arrival in arrivals if arrival >= s_s), math.inf)
+        return next_waypoint(self.grid, float(s_s))
 
     def tcp_speed_limit(self, s_s: float) -> float:
         """Programmed speed limit of the TCP at a programmed time [s]; valid until the next move begins [m/s].
 
         A task gives a limit for each move; for other paths the limit is their greatest speed.
         """
-        if not 0.0 <= s_s < self.duration_s:
-            return float(self.tcp_speed_max[0 if s_s < 0.0 else self.end])
-        at = math.ceil(s_s % self.cycle_s / STEP_S - _ON_GRID)
-        return float(self.tcp_speed_max[min(at, len(self.q) - 1)])
+        return tcp_speed_limit(self.grid, float(s_s))
 
     def sample(self, s_s: float) -> ReferencePoint:
         """The reference ``s_s`` seconds of programmed time after its start.
@@ -317,9 +314,38 @@ class Reference:
         The position is a cubic through the grid points. Velocity and acceleration are its exact derivatives. Pose and
         twist of the TCP follow from position and velocity. Before the start and after the end the reference is at rest.
         """
-        q, dq, ddq = place(self.grid, s_s)
-        pose = self.model.pose(q, dq)
-        return ReferencePoint(q, dq, ddq, pose.T_world_tcp, apply(pose.J_tcp, dq))
+        return sample(self.grid, self.model.chain, float(s_s))
+
+
+@njit(cache=True)
+def sample(grid: Grid, chain: Chain, s_s: float) -> ReferencePoint:
+    """Samples a path for a robot; see ``Reference.sample``."""
+    q, dq, ddq = place(grid, s_s)
+    T, J = tcp_jacobian(chain, axis_frames(chain, q))
+    return ReferencePoint(q, dq, ddq, T, apply(J, dq))
+
+
+@njit(cache=True)
+def next_waypoint(grid: Grid, s_s: float) -> float:
+    """Programmed time of the next arrival at a waypoint; see ``Reference.next_waypoint`` [s]."""
+    if not len(grid.waypoints_s) or s_s > grid.duration_s:
+        return np.inf
+    cycle_s = (len(grid.q) - 1) * STEP_S
+    cycle = math.floor(s_s / cycle_s)
+    for n in (cycle, cycle + 1):
+        for at_s in grid.waypoints_s:
+            if n * cycle_s + at_s >= s_s:
+                return n * cycle_s + at_s
+    return np.inf
+
+
+@njit(cache=True)
+def tcp_speed_limit(grid: Grid, s_s: float) -> float:
+    """Programmed speed limit of the TCP; see ``Reference.tcp_speed_limit`` [m/s]."""
+    if not 0.0 <= s_s < grid.duration_s:
+        return float(grid.tcp_speed_max[0 if s_s < 0.0 else grid.end])
+    at = math.ceil(s_s % ((len(grid.q) - 1) * STEP_S) / STEP_S - _ON_GRID)
+    return float(grid.tcp_speed_max[min(at, len(grid.q) - 1)])
 
 
 @njit(cache=True)
@@ -345,7 +371,28 @@ def _cubic(
     return q, dq, (2 * b + share * 6 * a) / step_s**2
 
 
-def advance(reference: Reference, s_s: float, dt_s: float, tcp_error_m: float, plan: Plan) -> tuple[float, float]:
+class Waits(NamedTuple):
+    """Settings of a reference that waits for the robot, as numbers for kernels."""
+
+    by_path: bool  #: False: the programmed time runs with the clock
+    lead_m: float  #: the reference stops if the TCP is this far away [m]
+    waypoint_m: float  #: it leaves a waypoint once the TCP is this close [m]
+    catch_up_m_per_s: float  #: TCP speed that is always allowed; inf: any [m/s]
+
+
+def waits(plan: Plan) -> Waits:
+    """The settings of the reference as numbers."""
+    free = plan.catch_up_speed_m_per_s == "free"
+    return Waits(
+        plan.reference == "path",
+        float(plan.max_reference_lead_m),
+        float(plan.waypoint_m),
+        math.inf if free else float(plan.catch_up_speed_m_per_s),
+    )
+
+
+@njit(cache=True)
+def advance(grid: Grid, s_s: float, dt_s: float, tcp_error_m: float, rules: Waits) -> tuple[float, float]:
     """Advances the programmed time by one tick.
 
     With ``time`` the programmed time runs with the clock, so a robot that must wait falls behind the reference.
@@ -355,28 +402,29 @@ def advance(reference: Reference, s_s: float, dt_s: float, tcp_error_m: float, p
     the programmed time never runs backwards.
 
     Args:
-        reference: The programmed path.
+        grid: The programmed path.
         s_s: Programmed time [s].
         dt_s: Length of the tick [s].
         tcp_error_m: Distance from the TCP to the reference at ``s_s`` [m].
-        plan: Settings of the reference: its mode and when it waits.
+        rules: Mode of the reference and when it waits.
 
     Returns:
         Programmed time at the next tick [s] and the rate in [0, 1]: the reference's velocity is ``rate * twist``.
     """
-    if plan.reference == "time":
+    if not rules.by_path:
         return s_s + dt_s, 1.0
-    slack = 2.0 - 2.0 * tcp_error_m / plan.max_reference_lead_m  # 1 at half the allowed lead, 0 at the full lead
+    slack = 2.0 - 2.0 * tcp_error_m / rules.lead_m  # 1 at half the allowed lead, 0 at the full lead
     if not slack > 0.0:
         return s_s, 0.0
     rate = 1.0 if slack >= 1.0 else slack * slack * (3.0 - 2.0 * slack)
     ahead_s = s_s + rate * dt_s
-    if not tcp_error_m <= plan.waypoint_m:
-        ahead_s = min(ahead_s, reference.next_waypoint(s_s))
+    if not tcp_error_m <= rules.waypoint_m:
+        ahead_s = min(ahead_s, next_waypoint(grid, s_s))
     return ahead_s, (ahead_s - s_s) / dt_s
 
 
-def tcp_speed_cap(reference: Reference, s_s: float, plan: Plan) -> float:
+@njit(cache=True)
+def tcp_speed_cap(grid: Grid, s_s: float, rules: Waits) -> float:
     """Largest allowed TCP speed of a robot that follows a reference, also while it catches up [m/s].
 
     A reference that waits leaves a waypoint only after the TCP is near it. Robot and reference are then on the same
@@ -384,12 +432,33 @@ def tcp_speed_cap(reference: Reference, s_s: float, plan: Plan) -> float:
     greatest limit of all moves applies.
 
     Args:
-        reference: The programmed path.
+        grid: The programmed path.
         s_s: Programmed time [s].
-        plan: Settings of the reference: its mode and the allowed speed for catching up.
+        rules: Mode of the reference and the allowed speed for catching up.
     """
-    if plan.catch_up_speed_m_per_s == "free":
-        return math.inf
-    waits = plan.reference == "path"
-    limit = reference.tcp_speed_limit(s_s) if waits else float(reference.tcp_speed_max.max())
-    return max(limit, plan.catch_up_speed_m_per_s)
+    if rules.catch_up_m_per_s == np.inf:
+        return np.inf
+    limit = tcp_speed_limit(grid, s_s) if rules.by_path else grid.tcp_speed_max.max()
+    return max(limit, rules.catch_up_m_per_s)
+
+
+@njit(cache=True)
+def follow(
+    grid: Grid, chain: Chain, s_s: float, T_world_ref: Floats, T_world_tcp: Floats, dt_s: float, rules: Waits
+) -> tuple[float, float, ReferencePoint, float]:
+    """One tick of the reference of a robot.
+
+    Args:
+        grid: The programmed path.
+        chain: The robot.
+        s_s: Programmed time [s].
+        T_world_ref: (4, 4) the reference at that time.
+        T_world_tcp: (4, 4) the TCP.
+        dt_s: Length of the tick [s].
+        rules: When the reference waits.
+
+    Returns:
+        Programmed time at the next tick [s], the rate, the reference at that time, and the allowed TCP speed [m/s].
+    """
+    s_s, rate = advance(grid, s_s, dt_s, norm_n(T_world_tcp[:3, 3] - T_world_ref[:3, 3]), rules)
+    return s_s, rate, sample(grid, chain, s_s), tcp_speed_cap(grid, s_s, rules)

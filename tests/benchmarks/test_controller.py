@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -49,7 +48,7 @@ def tasks(robot: RobotModel) -> Iterator[Asked]:
 @pytest.mark.benchmark
 @pytest.mark.parametrize("soft", [False, True])
 def test_few_rows_beside_all_rows_by_daqp(benchmark: BenchmarkFixture, robot: RobotModel, soft: bool) -> None:
-    problems = [tick._replace(task=replace(tick.task, soft=soft)) for tick in tasks(robot)]
+    problems = [tick._replace(task=tick.task._replace(soft=soft)) for tick in tasks(robot)]
     benchmark.pedantic(lambda: [minimise(tick.task) for tick in problems], rounds=3, warmup_rounds=1)  # type: ignore[no-untyped-call]
     if benchmark.stats is None:
         return

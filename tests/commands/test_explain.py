@@ -24,7 +24,8 @@ from hrcreplay.pipeline import assembly
 from hrcreplay.records import Floats
 from hrcreplay.robot.control import active_constraints
 from hrcreplay.robot.control.active_constraints import LinearRows
-from hrcreplay.robot.control.minimiser import SLACK, Problem
+from hrcreplay.robot.control.metric_rows import Problem
+from hrcreplay.robot.control.row_search import SLACK
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import Run
 from tests.facts import facts, tells

@@ -9,7 +9,7 @@ from hrcreplay.geometry.distances import EXACT_M
 from hrcreplay.kernels import njit
 from hrcreplay.records import Floats
 from hrcreplay.robot.control.separation import Obstacles
-from hrcreplay.robot.model import RobotPose
+from hrcreplay.robot.kinematics import RobotPose
 
 #: coal searches a polytope of up to this many points one by one, so it needs no hull's edges.
 MOST_POINTS = 32

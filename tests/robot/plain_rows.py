@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hrcreplay.records import Floats
-from hrcreplay.robot.model import RobotPose
+from hrcreplay.robot.kinematics import RobotPose
 
 
 @dataclass(frozen=True, slots=True)

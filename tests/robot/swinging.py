@@ -22,10 +22,12 @@ from hrcreplay.robot.control.control_step import (
     standstill_reason,
     stop_axis_by_axis,
 )
-from hrcreplay.robot.control.minimiser import SLACK, Problem
+from hrcreplay.robot.control.metric_rows import Problem
 from hrcreplay.robot.control.qp_controller import QpContext, Target, problem, propose
+from hrcreplay.robot.control.row_search import SLACK
 from hrcreplay.robot.control.separation import Obstacles, obstacles
-from hrcreplay.robot.model import RobotModel, RobotPose, irb140
+from hrcreplay.robot.kinematics import RobotPose
+from hrcreplay.robot.model import RobotModel, irb140
 from hrcreplay.settings.load import load_settings
 from tests.robot.distances import by_coal
 from tests.robot.people import cloud, volumes

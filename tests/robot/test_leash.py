@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from hrcreplay.robot.task import Reference, advance
+from hrcreplay.robot.task import Reference, advance, waits
 from hrcreplay.settings.sections import Plan
 from tests.robot.tasks import pick_and_place, robot
 
@@ -16,20 +16,20 @@ __all__ = ["pick_and_place", "robot"]  # fixtures
 
 
 def test_time_runs_with_the_clock(pick_and_place: Reference) -> None:
-    assert advance(pick_and_place, 1.0, 0.004, 9.0, Plan(reference="time")) == (1.004, 1.0)
+    assert advance(pick_and_place.grid, 1.0, 0.004, 9.0, waits(Plan(reference="time"))) == (1.004, 1.0)
 
 
 def test_path_waits_on_a_taut_leash_and_never_turns_back(pick_and_place: Reference) -> None:
-    leash = Plan(reference="path", max_reference_lead_m=0.05, waypoint_m=0.05)
+    leash = waits(Plan(reference="path", max_reference_lead_m=0.05, waypoint_m=0.05))
     errors = np.linspace(0, 0.08, 400)
-    steps = [advance(pick_and_place, 1.0, 0.004, e, leash) for e in errors]
+    steps = [advance(pick_and_place.grid, 1.0, 0.004, e, leash) for e in errors]
     rates = np.array([rate for _, rate in steps])
     assert_allclose(rates[errors <= 0.025], 1, atol=1e-12)
     assert (rates[errors >= 0.05] == 0).all()
     assert (np.diff(rates) <= 1e-12).all()
     assert np.abs(np.diff(rates)).max() < 0.02  # no jump
     assert_allclose([s for s, _ in steps], 1.0 + 0.004 * rates)
-    assert advance(pick_and_place, 1.0, 0.004, float("nan"), leash) == (1.0, 0.0)
+    assert advance(pick_and_place.grid, 1.0, 0.004, float("nan"), leash) == (1.0, 0.0)
 
 
 def test_a_held_robot_is_waited_for_and_skips_no_waypoint(pick_and_place: Reference) -> None:
@@ -45,7 +45,7 @@ def test_a_held_robot_is_waited_for_and_skips_no_waypoint(pick_and_place: Refere
             tcp = tcp + min(1.0, 1.2 * tick / max(way, 1e-12)) * (goal - tcp)
         error = float(np.linalg.norm(target - tcp))
         assert error < leash.max_reference_lead_m + 2.2 * tick
-        s_next, rate = advance(pick_and_place, s, tick, error, leash)
+        s_next, rate = advance(pick_and_place.grid, s, tick, error, waits(leash))
         assert s <= s_next <= s + tick
         passed += [error for arrival in pick_and_place.waypoints_s if s <= arrival < s_next]
         evaded = max(evaded, error if s_next > s else 0.0)

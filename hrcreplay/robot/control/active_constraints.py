@@ -26,8 +26,10 @@ from hrcreplay.robot.control.controllers import (
     ScalingController,
     SsmController,
 )
-from hrcreplay.robot.control.minimiser import SLACK, Problem, Solution, minimise
-from hrcreplay.robot.control.separation import Approach, Obstacles, tick_rows
+from hrcreplay.robot.control.metric_rows import Problem
+from hrcreplay.robot.control.minimiser import Solution, minimise
+from hrcreplay.robot.control.row_search import SLACK
+from hrcreplay.robot.control.separation import Approach, Obstacles, rows_of_people
 from hrcreplay.robot.control.static_obstacles import StaticObstacles, plane_rows
 from hrcreplay.robot.model import RobotModel
 
@@ -105,7 +107,8 @@ def _by_program(controller: QpController, seen: Observation) -> tuple[Proposals,
         found = {"unsolved": solved.status, "conflict": conflict(all_rows(task))}
     if controller.static is None:
         return proposals, found
-    which, _, _ = plane_rows(controller.static, seen.sight.pose, 1.0)
+    pose = seen.sight.pose
+    which, _ = plane_rows(controller.static.shapes, pose.ends_m, pose.J_ends, 1.0)
     return proposals, name_planes(found, which, controller.static)
 
 
@@ -141,7 +144,7 @@ def _rows(controller: Controller, seen: Observation, give_way_m: float) -> Appro
     if pairs is None:
         raise ValueError("why: the distances from people are not known")
     rhs_m2 = pairs.constraint_rhs_m2(plan.constraint_rhs, give_way_m)
-    return tick_rows(seen.sight.pose, seen.obstacles, rhs_m2, pairs.distance_m, seen.horizon_s + plan.lead_s)
+    return rows_of_people(seen.sight.pose, seen.obstacles, pairs, rhs_m2, seen.horizon_s + plan.lead_s)
 
 
 def _protective(controller: SsmController, seen: Observation) -> dict[str, Any]:

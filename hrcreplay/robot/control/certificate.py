@@ -3,8 +3,9 @@
 The certificate uses conservative advancement (Mirtich, 1996). Between two positions of the axes, a point of a link
 moves by at most the sum over the axes of its largest distance from the axis times the angle that the axis turns. If the
 distance between link and volume is larger, the motion between the two positions is clear. A plane between link and
-volume bounds the distance from below. coal finds the plane, and one pass over the vertices proves the bound for any
-plane. The certificate shares no code with the distances in the rows of Eq. (66i), so an error there does not affect it.
+volume bounds the distance from below, and one pass over the vertices proves the bound of any plane. The plane is that
+of the previous tick, else that of the search for the distance (``geometry.distances``), else coal's. The proof shares
+no code with these searches: an error in them can only refuse a motion.
 
 By induction from standstill, no link touches the person while the robot moves, under two conditions: the robot does
 not retreat, and the person stays inside the volumes of each tick until their horizon, the end of the stop that follows.
@@ -21,10 +22,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import coal
 import numpy as np
 
+from hrcreplay.geometry.distances import Carriers, carriers, segment_distance, separating_plane
 from hrcreplay.geometry.small_matrices import apply
 from hrcreplay.geometry.vectors import dot3, dot_n, norm_n
 from hrcreplay.kernels import njit
@@ -43,7 +46,8 @@ from hrcreplay.robot.control.control_step import (
     Taken,
 )
 from hrcreplay.robot.control.separation import Obstacles
-from hrcreplay.robot.control.static_obstacles import StaticObstacles
+from hrcreplay.robot.control.static_obstacles import StaticObstacles, StaticShapes, no_shapes
+from hrcreplay.robot.kinematics import Arm, Chain, ends_at
 from hrcreplay.robot.model import RobotModel
 
 #: Rounding tolerance of the check that a link moves away [m^2/s].
@@ -83,20 +87,25 @@ REFUSED, CLEAR, OPENING = range(3)
 RETREAT_SPEED = 0.25
 
 
-class _Course:
-    """A step and the stop after it, row by row; the ends of the links are computed at their first use."""
+class Course(NamedTuple):
+    """A step and the stop after it, row by row."""
 
-    def __init__(self, robot: RobotModel, q: Floats, dq: Floats, dt_s: float) -> None:
-        self.robot, self.q, self.dq, self.dt_s = robot, q, dq, dt_s
-        self.radius_m = np.array([segment.radius_m for segment in robot.segments])
-        self.travel = _travel(q, dq, robot.axis_reach_m, dt_s)  #: (n, s) upper bound of the travel until each row [m]
-        self._rows: dict[int, Floats] = {}
+    q: Floats  #: (n, nv) [rad]
+    dq: Floats  #: (n, nv) [rad/s]
+    ends: Floats  #: (n, s, 2, 3) ends of the links; NaN until a row is needed [m]
+    travel: Floats  #: (s, n) upper bound of the travel of a point of each link until each row [m]
 
-    def ends(self, row: int) -> Floats:
-        """(s, 2, 3) ends of the links at a row [m]."""
-        if row not in self._rows:
-            self._rows[row] = self.robot.ends_m(self.q[row])
-        return self._rows[row]
+
+#: Results of the check of a pair without coal: it keeps clear; it certainly does not, because it is too near;
+#: it is not proven.
+KEEPS, TOO_CLOSE, OPEN = range(3)
+
+
+class Unproven(NamedTuple):
+    """Pairs of a motion that are not proven to keep clear."""
+
+    pairs: Ints  #: (n, 2) link and limb or object, or index of the pair of links and -1
+    results: Ints  #: (n,) TOO_CLOSE or OPEN
 
 
 def clear(
@@ -131,69 +140,253 @@ def clear(
         The verdict and the planes for the next tick. The verdict is also REFUSED if a number is not finite, the stop
         leaves the range of an axis, an axis jumps, or coal finds no distance.
     """
-    q, dq = np.vstack((current_stop.q[:1], stop.q)), np.vstack((current_stop.dq[:1], stop.dq))
-    last = stop.q[-1]
-    within = np.all((robot.q_min <= last) & (last <= robot.q_max))
-    if not (obstacles.known and within and _can_be_done(q, dq, robot.ddq_max * dt_s, dt_s)):
+    if not obstacles.known:
         return REFUSED, planes
-    course = _Course(robot, q, dq, dt_s)
-    if static is None:
-        return _clear_of_people(course, obstacles, clearance_m, planes, retreat_m)
-    limbs, objects = len(obstacles.radius_m), len(static.radius_m)
-    if planes.shape[:2] != (len(robot.segments), limbs + objects):
-        planes = np.zeros((len(robot.segments), limbs + objects, 3))
-    people, beside = (np.ascontiguousarray(part) for part in np.split(planes, [limbs], axis=1))
-    verdict, people = _clear_of_people(course, obstacles, clearance_m, people, retreat_m)
-    if verdict != REFUSED and not _clear_of_static(course, static, beside):
+    shapes = no_shapes(len(robot.segments), robot.nv) if static is None else static.shapes
+    hulls = obstacles.vertices_m, obstacles.offsets, obstacles.radius_m, obstacles.boxes_m
+    rows = current_stop.q, current_stop.dq, stop.q, stop.dq
+    done, course, planes, people, beside = check(robot.arm, *rows, *hulls, clearance_m, dt_s, planes, shapes)
+    if not done:
+        return REFUSED, planes
+    verdict = CLEAR
+    if len(people.pairs):
+        keep_m = _kept(robot.arm, obstacles.radius_m, clearance_m)
+        verdict = _clear_of_people(robot, course, obstacles, keep_m, planes, retreat_m, people)
+    if verdict != REFUSED and len(beside.pairs) and not _clear_of_static(robot, course, shapes, planes, beside, dt_s):
         verdict = REFUSED
-    return verdict, np.concatenate((people, beside), axis=1)
-
-
-def _clear_of_people(
-    course: _Course, obstacles: Obstacles, clearance_m: float, planes: Floats, retreat_m: float
-) -> tuple[int, Floats]:
-    """The verdict of `clear` on the volumes of people, and the planes for the next tick."""
-    keep_m = course.radius_m[:, None] + obstacles.radius_m + (clearance_m + MARGIN_M)
-    if planes.shape[:2] != keep_m.shape:
-        planes = np.zeros((*keep_m.shape, 3))
-    far, hulls = course.travel[-1][:, None] + keep_m, (obstacles.vertices_m, obstacles.offsets)
-    undecided = _undecided(course.ends(0), *hulls, obstacles.boxes_m, planes, far)
-    if len(undecided):
-        planes = planes.copy()
-    verdict, motion = CLEAR, None
-    for link, limb in undecided.tolist():
-        vertices = obstacles.vertices_m[obstacles.offsets[limb] : obstacles.offsets[limb + 1]]
-        if _keeps_off(course, link, vertices, course.travel[:, link], keep_m[link, limb], planes[link, limb]):
-            continue
-        a, b = course.ends(0)[link]
-        gap = _gap(a, b, planes[link, limb], vertices) - keep_m[link, limb]
-        if not -retreat_m < gap <= 0.0:
-            return REFUSED, planes
-        motion = course.robot.link_motion(course.q, course.dq) if motion is None else motion
-        if not _moves_away(motion.ends_m[:, link], motion.twist[:, link], vertices):
-            return REFUSED, planes
-        verdict = OPENING
     return verdict, planes
 
 
-def _clear_of_static(course: _Course, static: StaticObstacles, planes: Floats) -> bool:
-    """Checks objects and pairs of links; writes the planes of objects for the next tick to ``planes``.
+def _clear_of_people(
+    robot: RobotModel,
+    course: Course,
+    obstacles: Obstacles,
+    keep_m: Floats,
+    planes: Floats,
+    retreat_m: float,
+    unproven: Unproven,
+) -> int:
+    """The verdict of `clear` on the pairs of links and limbs that are not proven without coal; writes to ``planes``."""
+    verdict, motion = CLEAR, None
+    for (link, limb), result in zip(unproven.pairs.tolist(), unproven.results.tolist(), strict=True):
+        vertices = obstacles.vertices_m[obstacles.offsets[limb] : obstacles.offsets[limb + 1]]
+        travel, plane, keep = course.travel[link], planes[link, limb], float(keep_m[link, limb])
+        if result == OPEN and _keeps_off(robot.arm.chain, course, link, vertices, travel, keep, plane):
+            continue
+        a, b = course.ends[0, link]
+        gap = _gap(a, b, plane, vertices) - keep
+        if not -retreat_m < gap <= 0.0:
+            return REFUSED
+        motion = robot.link_motion(course.q, course.dq) if motion is None else motion
+        if not _moves_away(motion.ends_m[:, link], motion.twist[:, link], vertices):
+            return REFUSED
+        verdict = OPENING
+    return verdict
 
-    A point of the outer link of a pair moves relative to the inner one only by the axes between them.
-    """
-    keep_m = static.keep_m + MARGIN_M
-    far, hulls = course.travel[-1][:, None] + keep_m, (static.vertices_m, static.offsets)
-    for link, hull in _undecided(course.ends(0), *hulls, static.boxes_m, planes, far).tolist():
-        vertices = static.vertices_m[static.offsets[hull] : static.offsets[hull + 1]]
-        if not _keeps_off(course, link, vertices, course.travel[:, link], keep_m[link, hull], planes[link, hull]):
-            return False
-    travel = _travel(course.q, course.dq, static.pair_reach_m, course.dt_s)
-    pair_keep_m = static.pair_keep_m + MARGIN_M
-    for pair in _pairs_undecided(course.ends(0), static.pairs, travel[-1] + pair_keep_m).tolist():
-        link, other = static.pairs[pair].tolist()
-        if not _keeps_off(course, link, other, travel[:, pair], pair_keep_m[pair], np.zeros(3)):
+
+def _clear_of_static(
+    robot: RobotModel, course: Course, static: StaticShapes, planes: Floats, unproven: Unproven, dt_s: float
+) -> bool:
+    """Checks the objects and pairs of links that are not proven without coal; writes to ``planes``."""
+    if np.any(unproven.results == TOO_CLOSE):
+        return False
+    limbs, chain = planes.shape[1] - static.keep.shape[1], robot.arm.chain
+    apart = travel_of(course.q, course.dq, static.pair_reach, dt_s)
+    for one, hull in unproven.pairs.tolist():
+        if hull < 0:
+            link, other = static.pairs[one].tolist()
+            keep_m = float(static.pair_keep[one]) + MARGIN_M
+            if not _keeps_off(chain, course, link, other, apart[one], keep_m, np.zeros(3)):
+                return False
+            continue
+        vertices, keep_m = static.vertices[static.offsets[hull] : static.offsets[hull + 1]], static.keep[one, hull]
+        plane = planes[one, limbs + hull]
+        if not _keeps_off(chain, course, one, vertices, course.travel[one], float(keep_m) + MARGIN_M, plane):
             return False
     return True
+
+
+@njit(cache=True)
+def check(
+    arm: Arm,
+    q_now: Floats,
+    dq_now: Floats,
+    q_stop: Floats,
+    dq_stop: Floats,
+    vertices: Floats,
+    offsets: Ints,
+    radius: Floats,
+    boxes: Floats,
+    clearance_m: float,
+    dt_s: float,
+    planes: Floats,
+    static: StaticShapes,
+) -> tuple[bool, Course, Floats, Unproven, Unproven]:
+    """Checks a motion without coal.
+
+    Args:
+        arm: The manipulator.
+        q_now: (m, nv) rows of the current stop; the step begins at row 0 [rad].
+        dq_now: (m, nv) [rad/s].
+        q_stop: (n, nv) rows of the stop that begins at the end of the step [rad].
+        dq_stop: (n, nv) [rad/s].
+        vertices: (v, 3) of all limbs [m].
+        offsets: (l + 1,) index of each limb's first vertex.
+        radius: (l,) of the limbs' balls [m].
+        boxes: (l, 2, 3) boxes around the limbs' vertices [m].
+        clearance_m: Clearance beyond limb radius + link radius [m].
+        dt_s: Length of a tick [s].
+        planes: Planes of the previous tick, as in ``clear``.
+        static: Objects of the cell and pairs of links.
+
+    Returns:
+        False if the motion cannot be done or ends outside the range of an axis; the motion; the planes for the next
+        tick; the unproven pairs of links and limbs; and those of links and objects, then pairs of links.
+    """
+    q, dq = np.concatenate((q_now[:1], q_stop)), np.concatenate((dq_now[:1], dq_stop))
+    links, limbs, objects = len(arm.radius_m), len(radius), static.keep.shape[1]
+    known = planes.shape[0] == links and planes.shape[1] == limbs + objects
+    planes = planes.copy() if known else np.zeros((links, limbs + objects, 3))
+    course = Course(q, dq, np.full((len(q), links, 2, 3), np.nan), travel_of(q, dq, arm.axis_reach_m, dt_s))
+    done = bool(np.all((arm.q_min <= q[-1]) & (q[-1] <= arm.q_max)))
+    if not (done and _can_be_done(q, dq, arm.ddq_max * dt_s, dt_s)):
+        none = Unproven(np.empty((0, 2), np.int64), np.empty(0, np.int64))
+        return False, course, planes, none, none
+    course.ends[0] = ends_at(arm.chain, q[0])
+    keep = _kept(arm, radius, clearance_m)
+    people = _check_hulls(arm.chain, course, vertices, offsets, boxes, keep, planes, 0)
+    hulls = static.vertices, static.offsets, static.boxes
+    beside = _check_hulls(arm.chain, course, *hulls, static.keep + MARGIN_M, planes, limbs)
+    between = _check_links(arm.chain, course, static, travel_of(q, dq, static.pair_reach, dt_s))
+    both = Unproven(np.concatenate((beside.pairs, between.pairs)), np.concatenate((beside.results, between.results)))
+    return True, course, planes, people, both
+
+
+@njit(cache=True)
+def _kept(arm: Arm, radius: Floats, clearance_m: float) -> Floats:
+    """(s, l) distance to keep between the axis of a link and a limb's hull [m]."""
+    keep = np.empty((len(arm.radius_m), len(radius)))
+    for s in range(len(arm.radius_m)):
+        for k in range(len(radius)):
+            keep[s, k] = arm.radius_m[s] + radius[k] + (clearance_m + MARGIN_M)
+    return keep
+
+
+@njit(cache=True)
+def _check_hulls(
+    chain: Chain,
+    course: Course,
+    vertices: Floats,
+    offsets: Ints,
+    boxes: Floats,
+    keep: Floats,
+    planes: Floats,
+    first: int,
+) -> Unproven:
+    """Pairs of links and hulls that are not proven to keep clear; writes the planes found to ``planes``.
+
+    Args:
+        chain: The robot.
+        course: The motion; the ends of the links are added where they are needed.
+        vertices: (m, 3) of all hulls [m].
+        offsets: (l + 1,) index of each hull's first vertex.
+        boxes: (l, 2, 3) boxes around the hulls' vertices [m].
+        keep: (s, l) distance to keep [m].
+        planes: (s, >= first + l, 3) initial directions from link to hull.
+        first: Place of the first hull in ``planes``.
+    """
+    far, work = course.travel[:, -1].copy().reshape(-1, 1) + keep, carriers()
+    pairs = _undecided(course.ends[0], vertices, offsets, boxes, planes, first, far)
+    left, results, n = np.empty_like(pairs), np.empty(len(pairs), np.int64), 0
+    for s, k in pairs:
+        hull = vertices[offsets[k] : offsets[k + 1]]
+        result = _advance(chain, course, s, hull, keep[s, k], planes[s, first + k], work)
+        if result != KEEPS:
+            left[n, 0], left[n, 1], results[n] = s, k, result
+            n += 1
+    return Unproven(left[:n], results[:n])
+
+
+@njit(cache=True)
+def _advance(chain: Chain, course: Course, link: int, hull: Floats, keep: float, plane: Floats, work: Carriers) -> int:
+    """Checks one link against a hull by conservative advancement, with planes of ``separating_plane``.
+
+    Args:
+        chain: The robot.
+        course: The motion; the ends of the links are added where they are needed.
+        link: Index of the link.
+        hull: (m, 3) [m].
+        keep: Distance to keep [m].
+        plane: (3,) initial direction from the link to the hull; the last one is written to it.
+        work: Memory.
+    """
+    row, last, travel = 0, len(course.q) - 1, course.travel[link]
+    while True:
+        if math.isnan(course.ends[row, 0, 0, 0]):
+            course.ends[row] = ends_at(chain, course.q[row])
+        ends = course.ends[row, link]
+        there, high = _proven(travel, row, _gap(ends[0], ends[1], plane, hull) - keep), np.inf
+        if there < min(row + FEW, last):  # the previous plane proves too few rows
+            _, high = separating_plane(ends, hull, 0, len(hull), work, plane)
+            _make_unit(plane)
+            there = _proven(travel, row, _gap(ends[0], ends[1], plane, hull) - keep)
+        if there == last:
+            return KEEPS
+        if there <= row:
+            return OPEN if _proven(travel, row, high - keep) > row else TOO_CLOSE
+        row = there
+
+
+@njit(cache=True)
+def _check_links(chain: Chain, course: Course, static: StaticShapes, travel: Floats) -> Unproven:
+    """Pairs of links that are not proven to keep apart.
+
+    A point of the outer link of a pair moves relative to the inner one only by the axes between them.
+
+    Args:
+        chain: The robot.
+        course: The motion; the ends of the links are added where they are needed.
+        static: The pairs of links.
+        travel: (p, n) upper bound of the travel of the links of each pair against each other until each row [m].
+    """
+    keep, last = static.pair_keep + MARGIN_M, len(course.q) - 1
+    undecided = _pairs_undecided(course.ends[0], static.pairs, travel[:, -1] + keep)
+    left, results, n = np.full((len(undecided), 2), -1), np.empty(len(undecided), np.int64), 0
+    for p in undecided:
+        row, there, high = 0, 0, 0.0
+        while there < last:
+            if math.isnan(course.ends[row, 0, 0, 0]):
+                course.ends[row] = ends_at(chain, course.q[row])
+            low, high = _apart(course.ends[row, static.pairs[p, 0]], course.ends[row, static.pairs[p, 1]])
+            there = _proven(travel[p], row, low - keep[p])
+            if there <= row:
+                break
+            row = there
+        if there < last:
+            left[n, 0], results[n] = p, OPEN if _proven(travel[p], row, high - keep[p]) > row else TOO_CLOSE
+            n += 1
+    return Unproven(left[:n], results[:n])
+
+
+@njit(cache=True)
+def _apart(first: Floats, second: Floats) -> tuple[float, float]:
+    """Bounds of the distance between two segments (2, 3): the gap along the way between nearest points, its length."""
+    high, share, other = segment_distance(first, second)
+    normal = np.empty(3)
+    for c in range(3):
+        at = first[0, c] + share * (first[1, c] - first[0, c])
+        normal[c] = second[0, c] + other * (second[1, c] - second[0, c]) - at
+    _make_unit(normal)
+    return _gap(first[0], first[1], normal, second), high
+
+
+@njit(cache=True)
+def _make_unit(normal: Floats) -> None:
+    """Scales a direction (3,) to length 1, so that ``_gap`` is a bound; a zero vector proves nothing and stays."""
+    length = norm_n(normal)
+    if length > 0.0:
+        for c in range(3):
+            normal[c] /= length
 
 
 @njit(cache=True)
@@ -228,20 +421,23 @@ def _moves_away(ends: Floats, twist: Floats, vertices: Floats) -> bool:
     return True
 
 
-def _keeps_off(course: _Course, link: int, other: Floats | int, travel: Floats, keep_m: float, plane: Floats) -> bool:
-    """Checks one link against a limb, an object or another link by conservative advancement.
+def _keeps_off(
+    chain: Chain, course: Course, link: int, other: Floats | int, travel: Floats, keep_m: float, plane: Floats
+) -> bool:
+    """Checks one link against a limb, an object or another link by conservative advancement, with planes of coal.
 
     Args:
+        chain: The robot.
         course: The motion.
         link: Index of the link.
         other: (m, 3) vertices of the limb or object [m], or the index of the other link.
-        travel: (n,) result of `_travel` for the link, relative to the other [m].
+        travel: (n,) result of `travel_of` for the link, relative to the other [m].
         keep_m: Distance to keep [m].
         plane: (3,) initial direction from the link to the other; the last one is written to it.
     """
     row, last = 0, len(travel) - 1
     while True:
-        ends = course.ends(row)
+        ends = ends_at(chain, course.q[row])
         a, b = ends[link]
         vertices = ends[other] if isinstance(other, int) else other
         there = _proven(travel, row, _gap(a, b, plane, vertices) - keep_m)
@@ -286,8 +482,8 @@ def _can_be_done(q: Floats, dq: Floats, gain: Floats, dt_s: float) -> bool:
 
 
 @njit(cache=True)
-def _travel(q: Floats, dq: Floats, reach: Floats, dt_s: float) -> Floats:
-    """(n, s) upper bound of the travel of a point of each link until each row of a motion [m].
+def travel_of(q: Floats, dq: Floats, reach: Floats, dt_s: float) -> Floats:
+    """(s, n) upper bound of the travel of a point of each link until each row of a motion [m].
 
     Within a tick an axis turns by at most the larger of its speeds at the ends of the tick times the tick's length.
 
@@ -297,20 +493,22 @@ def _travel(q: Floats, dq: Floats, reach: Floats, dt_s: float) -> Floats:
         reach: (nv, s) largest distance of each link from each axis [m].
         dt_s: Length of a tick [s].
     """
-    travel = np.zeros((len(q), reach.shape[1]))
+    travel = np.zeros((reach.shape[1], len(q)))
     for i in range(1, len(q)):
         for j in range(q.shape[1]):
             turned = max(abs(q[i, j] - q[i - 1, j]), dt_s * max(abs(dq[i - 1, j]), abs(dq[i, j])))
             for s in range(reach.shape[1]):
-                travel[i, s] += turned * reach[j, s]
+                travel[s, i] += turned * reach[j, s]
         for s in range(reach.shape[1]):
-            travel[i, s] += travel[i - 1, s]
+            travel[s, i] += travel[s, i - 1]
     return travel
 
 
 @njit(cache=True)
-def _undecided(ends: Floats, vertices: Floats, offsets: Ints, boxes: Floats, normals: Floats, far: Floats) -> Ints:
-    """(n, 2) pairs of link and limb whose boxes and planes do not prove a distance larger than ``far``."""
+def _undecided(
+    ends: Floats, vertices: Floats, offsets: Ints, boxes: Floats, planes: Floats, first: int, far: Floats
+) -> Ints:
+    """(n, 2) pairs of link and hull whose boxes and planes do not prove a distance larger than ``far``."""
     links, limbs = far.shape
     pairs = np.empty((links * limbs, 2), np.int64)
     n = 0
@@ -323,7 +521,8 @@ def _undecided(ends: Floats, vertices: Floats, offsets: Ints, boxes: Floats, nor
                 square += away * away
             if square > far[s, k] ** 2:
                 continue
-            if _gap(ends[s, 0], ends[s, 1], normals[s, k], vertices[offsets[k] : offsets[k + 1]]) > far[s, k]:
+            plane, hull = planes[s, first + k], vertices[offsets[k] : offsets[k + 1]]
+            if _gap(ends[s, 0], ends[s, 1], plane, hull) > far[s, k]:
                 continue
             pairs[n, 0], pairs[n, 1] = s, k
             n += 1

@@ -13,7 +13,7 @@ import numpy as np
 
 from hrcreplay.records import Bools, Floats
 from hrcreplay.robot.control.separation import Obstacles, Separation
-from hrcreplay.robot.model import RobotPose
+from hrcreplay.robot.kinematics import RobotPose
 
 
 @dataclass(frozen=True)

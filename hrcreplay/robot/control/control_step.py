@@ -11,16 +11,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
 from hrcreplay.kernels import njit
-from hrcreplay.records import Floats, MotionRow
+from hrcreplay.records import Floats, Ints, MotionRow
 from hrcreplay.robot.control.contact_speed import ContactSpeeds
-from hrcreplay.robot.control.separation import Obstacles, Separation, separation
-from hrcreplay.robot.model import RobotModel, RobotPose
-from hrcreplay.robot.task import Grid, place
+from hrcreplay.robot.control.separation import NearestLink, Obstacles, Separation, measure
+from hrcreplay.robot.kinematics import Arm, RobotPose, pose_at
+from hrcreplay.robot.model import RobotModel
+from hrcreplay.robot.task import Grid, Waits, place, waits
 from hrcreplay.settings.sections import Plan
 
 
@@ -55,12 +57,19 @@ def stop_straight(q: Floats, dq: Floats, ddq_max: Floats, dt_s: float) -> Stop:
         ddq_max: (nv,) [rad/s^2].
         dt_s: Length of a tick [s].
     """
-    rows_q, rows_dq = _straight(q, dq, ddq_max, dt_s)
-    return Stop(rows_q, rows_dq, np.full((len(rows_q), 2), math.nan))
+    return Stop(*straight(q, dq, ddq_max, dt_s))
 
 
 @njit(cache=True)
-def _straight(q: Floats, dq: Floats, ddq_max: Floats, dt_s: float) -> tuple[Floats, Floats]:
+def straight(q: Floats, dq: Floats, ddq_max: Floats, dt_s: float) -> tuple[Floats, Floats, Floats]:
+    """The rows of ``stop_straight``.
+
+    Args:
+        q: (nv,) initial position [rad].
+        dq: (nv,) initial velocity, finite [rad/s].
+        ddq_max: (nv,) [rad/s^2].
+        dt_s: Length of a tick [s].
+    """
     ticks = 0
     for j in range(len(q)):
         ticks = max(ticks, math.ceil(abs(dq[j]) / (ddq_max[j] * dt_s)))
@@ -71,7 +80,7 @@ def _straight(q: Floats, dq: Floats, ddq_max: Floats, dt_s: float) -> tuple[Floa
         for j in range(len(q)):
             rows_dq[i, j] = left * dq[j]
             rows_q[i, j] = rows_q[i - 1, j] + 0.5 * dt_s * (rows_dq[i - 1, j] + rows_dq[i, j])  # Eq. (68), (69)
-    return rows_q, rows_dq
+    return rows_q, rows_dq, np.full((ticks + 1, 2), np.nan)
 
 
 def stop_axis_by_axis(q: Floats, dq: Floats, ddq_max: Floats, dt_s: float) -> Stop:
@@ -83,12 +92,19 @@ def stop_axis_by_axis(q: Floats, dq: Floats, ddq_max: Floats, dt_s: float) -> St
         ddq_max: (nv,) [rad/s^2].
         dt_s: Length of a tick [s].
     """
-    rows_q, rows_dq = _stop_axis_by_axis(q, np.where(np.isfinite(dq), dq, 0.0), ddq_max, dt_s)
-    return Stop(rows_q, rows_dq, np.full((len(rows_q), 2), math.nan))
+    return Stop(*axis_by_axis(q, np.where(np.isfinite(dq), dq, 0.0), ddq_max, dt_s))
 
 
 @njit(cache=True)
-def _stop_axis_by_axis(q: Floats, dq: Floats, ddq_max: Floats, dt_s: float) -> tuple[Floats, Floats]:
+def axis_by_axis(q: Floats, dq: Floats, ddq_max: Floats, dt_s: float) -> tuple[Floats, Floats, Floats]:
+    """The rows of ``stop_axis_by_axis``.
+
+    Args:
+        q: (nv,) initial position [rad].
+        dq: (nv,) initial velocity, finite [rad/s].
+        ddq_max: (nv,) [rad/s^2].
+        dt_s: Length of a tick [s].
+    """
     ticks = 0
     for j in range(len(q)):
         ticks = max(ticks, math.ceil(abs(dq[j]) / (ddq_max[j] * dt_s)))
@@ -100,7 +116,7 @@ def _stop_axis_by_axis(q: Floats, dq: Floats, ddq_max: Floats, dt_s: float) -> t
             if i < ticks and abs(before) > gain:
                 rows_dq[i, j] = before - math.copysign(gain, before)
             rows_q[i, j] = rows_q[i - 1, j] + 0.5 * dt_s * (before + rows_dq[i, j])  # Eq. (68), (69)
-    return rows_q, rows_dq
+    return rows_q, rows_dq, np.full((ticks + 1, 2), np.nan)
 
 
 #: Largest number of ticks of a stop along a path; if it takes longer, there is no stop along the path.
@@ -203,7 +219,23 @@ class RobotState:
     dq: Floats  #: (nv,) [rad/s]
 
 
-@dataclass(frozen=True, slots=True)
+class QpRules(NamedTuple):
+    """Settings of Eq. (66) as numbers for kernels; see ``settings.sections.Plan``."""
+
+    q_p: tuple[float, float]
+    q_v: tuple[float, float]
+    path_gain_per_s: float
+    posture: float
+    jerk_s: float
+    smooth_s: float
+    tcp_acceleration_max: float
+    square: bool  #: whether the right-hand side of Eq. (14) is as printed
+    give_way_m: float
+    soft: bool
+    dt_s: float
+
+
+@dataclass(frozen=True)
 class PlanSettings:
     """Settings of Section 5, without the robot."""
 
@@ -233,6 +265,29 @@ class PlanSettings:
     def retreats(self, overlap_m: float) -> bool:
         """Return whether a robot whose link is ``overlap_m`` [m] inside a volume may slowly move out of it."""
         return 0.0 < overlap_m < self.retreat_m
+
+    @cached_property
+    def rules(self) -> QpRules:
+        """The settings of Eq. (66) as numbers."""
+        plan = self.plan
+        return QpRules(
+            q_p=(float(plan.q_p[0]), float(plan.q_p[1])),
+            q_v=(float(plan.q_v[0]), float(plan.q_v[1])),
+            path_gain_per_s=float(plan.path_gain_per_s),
+            posture=float(plan.posture),
+            jerk_s=float(plan.jerk_s),
+            smooth_s=float(plan.smooth_s),
+            tcp_acceleration_max=float(plan.tcp_acceleration_max),
+            square=plan.constraint_rhs == "square",
+            give_way_m=float(plan.give_way_m),
+            soft=plan.rows == "soft",
+            dt_s=float(self.dt_s),
+        )
+
+    @cached_property
+    def waits(self) -> Waits:
+        """The settings of the reference as numbers."""
+        return waits(self.plan)
 
     def without_jerk(self) -> PlanSettings:
         """The same settings without the limit on changes of the acceleration."""
@@ -282,9 +337,7 @@ class Sight:
     overlap_m: float = 0.0  #: depth of the link inside the volume, radii included [m]
 
 
-def observe(
-    robot: RobotModel, state: RobotState, obstacles: Obstacles, clearance_m: float, pose: RobotPose | None = None
-) -> Sight:
+def observe(robot: RobotModel, state: RobotState, obstacles: Obstacles, clearance_m: float) -> Sight:
     """Pose of the robot and nearest pair of link and limb.
 
     The clearance of Eq. (1), (2) of a pair is the limb's radius, Eq. (41), plus the link's, plus ``clearance_m``.
@@ -294,20 +347,48 @@ def observe(
         state: State of the robot at the tick.
         obstacles: The swept volumes of the tick.
         clearance_m: Clearance beyond limb radius + link radius [m].
-        pose: Pose of the robot in that state, if it is already computed.
     """
-    pose = robot.pose(state.q, state.dq) if pose is None else pose
-    finite = math.isfinite(state.q.sum()) and math.isfinite(pose.J_tcp.sum() + pose.dJdq_tcp.sum())
+    hulls = obstacles.vertices_m, obstacles.offsets, obstacles.radius_m
+    pose, finite, found = look(robot.arm, state.q, state.dq, *hulls, obstacles.known, clearance_m)
     if not finite or not obstacles.known:
         return Sight(pose, None, math.nan, -1, -1, NO_HUMAN if finite else NOT_FINITE)
-    radius = np.array([segment.radius_m for segment in robot.segments])
-    pairs = separation(pose, obstacles, radius[:, None] + obstacles.radius_m + clearance_m)
+    pairs, surface, link, limb = found
     if not pairs.distance_m.size:
         return Sight(pose, pairs, math.nan, -1, -1, 0)
-    surface, link, limb = pairs.nearest()
     if math.isnan(surface):
         return Sight(pose, None, math.nan, -1, -1, NO_DISTANCE)
     return Sight(pose, pairs, max(0.0, surface), obstacles.index(limb), link, 0, max(0.0, -surface))
+
+
+@njit(cache=True)
+def look(
+    arm: Arm,
+    q: Floats,
+    dq: Floats,
+    vertices: Floats,
+    offsets: Ints,
+    radius: Floats,
+    known: bool,
+    clearance_m: float,
+) -> tuple[RobotPose, bool, NearestLink]:
+    """Pose of the robot, whether it is finite, and the distances from people, without pairs if anything is unknown.
+
+    Args:
+        arm: The manipulator.
+        q: (nv,) [rad].
+        dq: (nv,) [rad/s].
+        vertices: (m, 3) of all limbs [m].
+        offsets: (l + 1,) index of each limb's first vertex.
+        radius: (l,) of the limbs' balls [m].
+        known: Whether all limbs are known.
+        clearance_m: Clearance beyond limb radius + link radius [m].
+    """
+    pose = pose_at(arm.chain, q, dq)
+    finite = math.isfinite(q.sum()) and math.isfinite(pose.J_tcp.sum() + pose.dJdq_tcp.sum())
+    if not (finite and known):
+        none = np.empty((0, 0))
+        return pose, finite, NearestLink(Separation(none, none), np.nan, -1, -1)
+    return pose, finite, measure(pose.ends_m, arm.radius_m, vertices, offsets, radius, clearance_m)
 
 
 class Taken(NamedTuple):
@@ -350,7 +431,7 @@ def motion_row(
         u=step.u,
         ref_m=ref_m,
         tcp_m=step.pose.T_world_tcp[:3, 3],
-        tcp_speed=step.pose.tcp_speed(state.dq),
+        tcp_speed=step.pose.tcp_speed,
         ref_speed=ref_speed,
         programme_s=programme_s,
         distance_m=step.distance_m,

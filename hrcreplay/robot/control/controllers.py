@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hrcreplay.geometry.vectors import norm_n
 from hrcreplay.records import Ints, Motion
 from hrcreplay.robot.control import path_controller, qp_controller
 from hrcreplay.robot.control.certificate import NO_PLANES, decide
@@ -36,7 +35,7 @@ from hrcreplay.robot.control.qp_controller import QpContext
 from hrcreplay.robot.control.separation import Obstacles
 from hrcreplay.robot.control.static_obstacles import StaticObstacles
 from hrcreplay.robot.model import RobotModel
-from hrcreplay.robot.task import Reference, ReferencePoint, advance, place, tcp_speed_cap
+from hrcreplay.robot.task import Reference, ReferencePoint, follow, place
 
 
 class ControllerTick(NamedTuple):
@@ -130,10 +129,10 @@ class QpController(Controller):
 
     def qp_context(self, seen: Observation) -> QpContext:
         """Advances the reference by one tick and returns the input of Eq. (66), whose target it is."""
-        error_m = norm_n(seen.sight.pose.T_world_tcp[:3, 3] - self.point.T_world_tcp[:3, 3])
-        self.s_s, rate = advance(self.reference, self.s_s, self.settings.dt_s, error_m, self.settings.plan)
-        self.point = self.reference.sample(self.s_s)
-        cap = tcp_speed_cap(self.reference, self.s_s, self.settings.plan)
+        at, settings, path = seen.sight.pose.T_world_tcp, self.settings, self.reference
+        self.s_s, rate, self.point, cap = follow(
+            path.grid, path.model.chain, self.s_s, self.point.T_world_tcp, at, settings.dt_s, settings.waits
+        )
         target = qp_controller.Target(self.point.T_world_tcp, rate * self.point.twist, self.point.q, cap)
         seen_until = seen.sight, seen.obstacles, seen.horizon_s
         return QpContext(self.robot, self.state, self.u, target, *seen_until, self.static)
@@ -195,7 +194,7 @@ class SsmController(PathController):
     def protective(self, seen: Observation, proposal: Proposal) -> tuple[Sight, float]:
         """The observation of the people's present volumes, and the protective separation distance of a step [m]."""
         pose, settings = seen.sight.pose, self.settings
-        present = observe(self.robot, self.state, seen.predict(0.0), settings.plan.clearance_m, pose)
+        present = observe(self.robot, self.state, seen.predict(0.0), settings.plan.clearance_m)
         return present, path_controller.protective_distance_m(
             pose, proposal.stop, settings.plan.human_speed, settings.latency_s, settings.dt_s
         )
@@ -222,7 +221,7 @@ class PflController(PathController):
     def propose(self, seen: Observation) -> Proposals:
         """The step with the largest allowed rate along the path, and the stop after it."""
         sight, settings = seen.sight, self.settings
-        guarded = observe(self.robot, self.state, seen.obstacles, settings.plan.clearance_m, sight.pose)
+        guarded = observe(self.robot, self.state, seen.obstacles, settings.plan.clearance_m)
         reason = sight.reason or standstill_reason(guarded, settings)
         if reason or sight.pairs is None:
             return reason

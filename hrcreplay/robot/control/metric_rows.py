@@ -44,6 +44,16 @@ class Limits(NamedTuple):
     J_high: Floats  #: (6,) [m/s, rad/s]
 
 
+class Problem(NamedTuple):
+    """Minimise ``w @ H @ w / 2 + g @ w`` over the next joint velocity w [rad/s], within limits and clear of people."""
+
+    H: Floats  #: (nv, nv)
+    g: Floats  #: (nv,)
+    limits: Limits
+    rows: Approach  #: Eq. (66i)
+    soft: bool  #: whether the rows of Eq. (66i) may be violated at a cost
+
+
 class Metric(NamedTuple):
     """Minimise ``y @ y / 2 + y @ b`` where ``low <= E @ y <= high``."""
 
@@ -285,48 +295,18 @@ def _with_planes(problem: Metric, y: Floats, rows: Approach, known: Ints, found:
     return found
 
 
-@njit(cache=True, error_model="numpy")
-def gather(
-    problem: Metric, z: Floats, limits: Limits, rows: Approach, known: Ints, sweeps: int, most: int
-) -> tuple[Metric, Floats, Ints]:
-    """Adds the approach rows that are probably active at the minimiser, found by coordinate descent only.
-
-    An unnecessary row costs the solver little; a missing row costs another call of the solver.
-
-    Args:
-        problem: The problem in its metric.
-        z: (m,) initial multipliers.
-        limits: Limits of axes and TCP.
-        rows: Approach rows of people.
-        known: (k, 4) indices of the approach rows in the problem, as in `worst_rows`.
-        sweeps: Number of passes over all rows before the next row is added.
-        most: Largest number of rows to add.
-
-    Returns:
-        The problem, the multipliers, and the indices of its approach rows.
-    """
-    for _ in range(most):
-        y, z = descend(problem, z, sweeps)
-        found = next_row(problem, y, limits, rows, known)
-        if found.outcome != NEW:
-            break
-        problem, z, known = join(problem, z, known, found)
-    return problem, z, known
-
-
 @njit(cache=True)
-def join(problem: Metric, z: Floats, known: Ints, found: Found) -> tuple[Metric, Floats, Ints]:
-    """Adds an approach row with multiplier 0; returns the problem, the multipliers and the indices of its rows.
+def join(problem: Metric, known: Ints, found: Found) -> tuple[Metric, Ints]:
+    """Adds an approach row; returns the problem and the indices of its approach rows.
 
     Args:
         problem: The problem in its metric.
-        z: (m,) multipliers.
         known: (k, 4) indices of the approach rows in the problem, as in `worst_rows`.
         found: The new row.
     """
     E, low = np.concatenate((problem.E, found.row.reshape(1, -1))), np.append(problem.low, -NONE)
     more = Metric(problem.L, problem.b, E, low, np.append(problem.high, found.high))
-    return more, np.append(z, 0.0), np.concatenate((known, found.key.reshape(1, -1)))
+    return more, np.concatenate((known, found.key.reshape(1, -1)))
 
 
 @njit(cache=True)

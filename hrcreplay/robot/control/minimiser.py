@@ -1,8 +1,7 @@
-"""The minimiser of Eq. (66) under its rows, by ProxQP. The only user of proxsuite.
+"""The minimiser of Eq. (66) under its rows, by ``row_search`` and, where that proves none, ProxQP.
 
-Every vertex of every limb has rows, and few of them are active at the minimiser. Therefore rows are added only while a
-candidate violates them: first the candidate of coordinate descent, then that of ProxQP. If the rows are soft, one slack
-[m/s] loosens all of them, so that the rows of people always leave a solution.
+The only user of proxsuite. If the rows are soft, one slack [m/s] loosens all of them, so that the rows of people always
+leave a solution.
 
 In about one of a hundred ticks near people, ProxQP returns a wrong solution or misses an existing one. Therefore it
 works in the metric of the cost and starts near the solution. If it fails, it runs again with other penalties. A
@@ -11,7 +10,6 @@ solution is accepted only if its multipliers prove it.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,35 +19,19 @@ from hrcreplay.geometry.small_matrices import apply, nonnegative_least_squares
 from hrcreplay.geometry.vectors import dot_n
 from hrcreplay.kernels import forgo
 from hrcreplay.records import Floats
-from hrcreplay.robot.control.metric_rows import (
-    CLEAR,
-    EMPTY,
-    HOPELESS,
-    KNOWN,
-    NONE,
-    Limits,
-    Metric,
-    are_numbers_known,
-    build_metric,
-    denied,
-    descend,
-    gather,
-    join,
-    next_row,
-    residual,
+from hrcreplay.robot.control.metric_rows import EMPTY, NONE, Limits, Metric, Problem, denied, descend, residual
+from hrcreplay.robot.control.row_search import (
+    INFEASIBLE,
+    MANY,
+    PROVEN,
+    RESIDUAL,
+    SOLVED,
+    UNKNOWN,
+    UNPROVEN,
+    go_on,
+    search,
 )
 from hrcreplay.robot.control.separation import Approach
-
-
-@dataclass(frozen=True, slots=True)
-class Problem:
-    """Minimise ``w @ H @ w / 2 + g @ w`` over the next joint velocity w [rad/s], within limits and clear of people."""
-
-    H: Floats  #: (nv, nv)
-    g: Floats  #: (nv,)
-    limits: Limits
-    rows: Approach  #: Eq. (66i)
-    soft: bool  #: whether the rows of Eq. (66i) may be violated at a cost
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,18 +50,6 @@ class Unsolved:
     status: str  #: the problem: "not finite", "infeasible" (proven), or the last status of the search
 
 
-#: Weight of the squared slack: the cost prefers a row violation of 1 mm/s to a TCP that is slower by 1 m/s.
-SLACK = 1000.0
-#: Largest number of rounds of adding rows and solving; then the problem counts as unsolved, and the robot stops.
-ROUNDS = 16
-#: Sweeps of coordinate descent before a row is added, and largest number of rows added before each run of ProxQP.
-SWEEPS, JOIN = 10, 40
-#: Multiplier, in the metric, above which a row holds the robot back.
-BINDING = 1e-8
-#: Largest residual, in the metric, with which multipliers prove a solution; the tolerance of ProxQP is a tenth of it.
-PROVEN = 2e-10
-#: Bounds of the TCP hold if they are violated by no more than this [m/s, rad/s].
-KEPT = 1e-8
 #: Tries of ProxQP, one after the other: sweeps of coordinate descent before the try, inverse penalty, and largest
 #: number of multiplier updates. Values and order were chosen on replays. The second try (-1) starts at the result of
 #: non-negative least squares: deep inside people the rows are nearly dependent, and ProxQP fails.
@@ -104,47 +74,38 @@ _proxqp = _load_proxqp()
 _dense = _proxqp.dense
 
 
+#: Outcome of a search without a minimiser -> its status.
+STATUS = {INFEASIBLE: "infeasible", UNKNOWN: "not finite", RESIDUAL: "residual", MANY: "too many rows"}
+
+
 def minimise(task: Problem) -> Solution | Unsolved:
     """Finds the minimiser over all rows. Raises no error for any numbers."""
-    limits, rows = task.limits, task.rows
-    if not are_numbers_known(task.H, task.g, limits, rows):
-        return Unsolved("not finite")
-    problem = build_metric(task.H, task.g, limits, task.soft, SLACK)
-    if not math.isfinite(problem.b.sum() + problem.E.sum()):
-        return Unsolved("not finite")
-    if np.any(problem.low > problem.high):
-        return Unsolved("infeasible")
-    fixed, known = len(problem.E), np.empty((0, 4), dtype=np.int64)
-    z = np.zeros(fixed)
-    for _ in range(ROUNDS):
-        problem, z, known = gather(problem, z, limits, rows, known, SWEEPS, JOIN)
-        solved = _solve(problem, z, limits)
+    at = search(task)
+    while at.outcome == UNPROVEN:  # a row more in each round
+        solved = _solve(at.problem, at.z, task.limits)
         if isinstance(solved, Unsolved):
             return solved
         y, z = solved
-        found = next_row(problem, y, limits, rows, known)
-        if found.outcome == HOPELESS:
-            return Unsolved("infeasible")
-        if found.outcome == KNOWN or not _keeps(limits, found.w):
-            return Unsolved("residual")
-        if found.outcome == CLEAR:
-            return Solution(found.w, bool(np.any(z[fixed:] > BINDING)), found.slack)
-        problem, z, known = join(problem, z, known, found)
-    return Unsolved("too many rows")
+        at = go_on(task, at.problem, z, at.known, y)
+    if at.outcome == SOLVED:
+        return Solution(at.w, at.held, at.slack)
+    return Unsolved(STATUS[at.outcome])
 
 
 def compile_second_tries() -> None:
-    """Compiles the kernels that run only after a try of ProxQP has failed, so that no session compiles them."""
-    none, rows = np.zeros(1), np.zeros(2)
-    problem = Metric(np.eye(1), none, np.zeros((2, 1)), rows, rows)
-    denied(problem, rows, Limits(none, none, np.zeros((6, 1)), np.zeros(6), np.zeros(6)))
-    _least_distance(problem)
-
-
-def _keeps(limits: Limits, w: Floats) -> bool:
-    """Return whether a velocity, clipped to the axes' bounds, also keeps the bounds of the TCP."""
-    twist = apply(limits.J, w)
-    return bool(np.all((limits.J_low - KEPT <= twist) & (twist <= limits.J_high + KEPT)))
+    """Compiles the kernels that run only where ``row_search`` proves no solution, so that no session compiles them."""
+    one, none, vertices = np.ones(1), np.zeros(1), np.empty((0, 3))
+    vertices.setflags(write=False)  # as vertices are
+    limits = Limits(-one, one, np.zeros((6, 1)), -np.ones(6), np.ones(6))
+    empty = np.empty((0, 2, 3)), np.empty((0, 2, 3, 1)), vertices, np.zeros(1, np.int64), np.empty((0, 2, 3))
+    rows = Approach(*empty, np.empty((0, 0)), np.empty((0, 0)), 1.0, np.empty((0, 1)), np.empty(0))
+    task = Problem(np.eye(1), none, limits, rows, soft=False)
+    at = search(task)
+    solved = _solve(at.problem, at.z, limits)
+    if not isinstance(solved, Unsolved):
+        go_on(task, at.problem, solved[1], at.known, solved[0])
+    denied(at.problem, at.z, limits)
+    _least_distance(at.problem)
 
 
 def _solve(problem: Metric, z: Floats, limits: Limits) -> tuple[Floats, Floats] | Unsolved:

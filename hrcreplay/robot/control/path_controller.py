@@ -22,8 +22,9 @@ from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.contact_speed import largest_rate
 from hrcreplay.robot.control.control_step import PlanSettings, Proposal, Proposals, Sight, Stop, stop_along_path
 from hrcreplay.robot.control.qp_controller import cartesian_bounds
-from hrcreplay.robot.control.separation import Obstacles, tick_rows, worst_rows
-from hrcreplay.robot.model import RobotModel, RobotPose
+from hrcreplay.robot.control.separation import Obstacles, rows_of_people, worst_rows
+from hrcreplay.robot.kinematics import RobotPose
+from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.task import Reference, place
 
 #: Rates that differ by no more than this are equal.
@@ -169,7 +170,7 @@ def _safe_rate(
     if pairs is None:
         return math.nan
     rhs_m2 = pairs.constraint_rhs_m2(settings.plan.constraint_rhs)
-    rows = tick_rows(sight.pose, obstacles, rhs_m2, pairs.distance_m, ahead_s)
+    rows = rows_of_people(sight.pose, obstacles, pairs, rhs_m2, ahead_s)
     for _ in range(ROUNDS):
         which, _, values = worst_rows(rows, rate * towards, HELD)
         if not len(which):

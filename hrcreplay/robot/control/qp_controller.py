@@ -17,25 +17,28 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hrcreplay.geometry.small_matrices import apply
 from hrcreplay.geometry.vectors import dot_n, norm_n, turn_between
 from hrcreplay.kernels import njit
-from hrcreplay.records import Floats
+from hrcreplay.records import Floats, Ints
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.certificate import RETREAT_SPEED
 from hrcreplay.robot.control.control_step import (
     PlanSettings,
     Proposal,
     Proposals,
+    QpRules,
     RobotState,
     Sight,
-    stop_axis_by_axis,
-    stop_straight,
+    Stop,
+    axis_by_axis,
+    straight,
 )
-from hrcreplay.robot.control.metric_rows import Limits
-from hrcreplay.robot.control.minimiser import Problem, Solution, minimise
-from hrcreplay.robot.control.separation import Obstacles, tick_rows
-from hrcreplay.robot.control.static_obstacles import StaticObstacles
+from hrcreplay.robot.control.metric_rows import Limits, Problem
+from hrcreplay.robot.control.minimiser import Solution, minimise
+from hrcreplay.robot.control.row_search import SOLVED, search
+from hrcreplay.robot.control.separation import Obstacles, Separation, constraint_rhs, tick_rows
+from hrcreplay.robot.control.static_obstacles import StaticObstacles, StaticShapes, no_shapes, plane_rows
+from hrcreplay.robot.kinematics import Arm, RobotPose, axis_frames, tcp_jacobian
 from hrcreplay.robot.model import RobotModel
 
 #: Bound on the rotation of the TCP for each unit of the bound on its translation [rad/m].
@@ -151,10 +154,13 @@ class QpContext(NamedTuple):
     static: StaticObstacles | None = None  #: objects of the cell and pairs of links
 
 
+@njit(cache=True)
 def pose_error(T_world_tcp: Floats, T_world_ref: Floats) -> Floats:
     """(6,) error of the TCP relative to the reference: translation [m], then rotation vector in the world [rad]."""
-    turn = turn_between(T_world_ref, T_world_tcp)
-    return np.concatenate([T_world_tcp[:3, 3] - T_world_ref[:3, 3], turn])
+    error = np.empty(6)
+    error[:3] = T_world_tcp[:3, 3] - T_world_ref[:3, 3]
+    error[3:] = turn_between(T_world_ref, T_world_tcp)
+    return error
 
 
 @njit(cache=True)
@@ -233,6 +239,48 @@ def with_posture(H: Floats, g: Floats, away: Floats, weight: float) -> tuple[Flo
 
 
 def problem(context: QpContext, settings: PlanSettings) -> Problem:
+    """Builds Eq. (66) at one instant, without solving it; see ``build``.
+
+    Args:
+        context: Robot, reference and people of the tick.
+        settings: Weights and limits.
+    """
+    return build(*_numbers(context, settings))
+
+
+class Instant(NamedTuple):
+    """What Eq. (66) depends on at one tick, without arm and settings, as numbers for kernels."""
+
+    q: Floats  #: (nv,) [rad]
+    dq: Floats  #: (nv,) [rad/s]
+    u_before: Floats  #: (nv,) acceleration of the previous tick [rad/s^2]
+    target: Target
+    pose: RobotPose
+    pairs: Separation
+    vertices: Floats  #: (m, 3) of all limbs, which are known [m]
+    offsets: Ints  #: (l + 1,) index of each limb's first vertex
+    boxes: Floats  #: (l, 2, 3) boxes around the limbs' vertices [m]
+    ahead_s: float  #: time that the rows of people look ahead [s]
+    static_ahead_s: float  #: time that the rows of objects and links look ahead [s]
+    speed_max: float  #: limit of the TCP's speed along each axis of the world [m/s]
+
+
+def _numbers(context: QpContext, settings: PlanSettings) -> tuple[Arm, QpRules, Instant, StaticShapes]:
+    """The input of Eq. (66) as numbers for kernels."""
+    robot, state, u_before, target, sight, obstacles, horizon_s, static = context
+    plan, pairs = settings.plan, sight.pairs
+    if pairs is None:
+        raise ValueError("problem: the distances from people are not known")
+    speed_max = min(plan.tcp_speed_max, RETREAT_SPEED) if settings.retreats(sight.overlap_m) else plan.tcp_speed_max
+    hulls = obstacles.vertices_m, obstacles.offsets, obstacles.boxes_m
+    ahead_s = horizon_s + plan.lead_s, static_ahead_s(horizon_s, settings)
+    now = Instant(state.q, state.dq, u_before, target, sight.pose, pairs, *hulls, *ahead_s, speed_max)
+    shapes = no_shapes(len(robot.segments), robot.nv) if static is None else static.shapes
+    return robot.arm, settings.rules, now, shapes
+
+
+@njit(cache=True)
+def build(arm: Arm, rules: QpRules, now: Instant, static: StaticShapes) -> Problem:
     """Builds Eq. (66) at one instant, without solving it.
 
     In addition to the printed equation the posture has a small weight (`with_posture`), the TCP keeps the programme's
@@ -241,41 +289,41 @@ def problem(context: QpContext, settings: PlanSettings) -> Problem:
     the factor by which the target velocity is further away than the velocity of the next tick (`dq_after`).
 
     Args:
-        context: Robot, reference and people of the tick.
-        settings: Weights and limits.
+        arm: The manipulator.
+        rules: Weights and limits.
+        now: State, reference and people of the tick.
+        static: Objects of the cell and pairs of links.
     """
-    robot, state, u_before, target, sight, obstacles, horizon_s, static = context
-    plan, dt_s, pose = settings.plan, settings.dt_s, sight.pose
-    J, dJdq = pose.J_tcp, pose.dJdq_tcp
+    pose, target, dt_s = now.pose, now.target, rules.dt_s
     error = pose_error(pose.T_world_tcp, target.T_world_tcp)
-    H, g = tracking_cost(error, J, dJdq, state.dq, target.twist, plan.q_p, plan.q_v, plan.path_gain_per_s, dt_s)
-    H, g = with_posture(H, g, state.q - target.q, plan.posture)
-    low, high = axes = joint_bounds(state.q, state.dq, robot.q_min, robot.q_max, robot.dq_max, robot.ddq_max, dt_s)
-    if plan.jerk_s > dt_s:
-        low, high = smooth_bounds(low, high, state.dq + dt_s * u_before, dt_s**2 / plan.jerk_s * robot.ddq_max)
-    speed_max = min(plan.tcp_speed_max, RETREAT_SPEED) if settings.retreats(sight.overlap_m) else plan.tcp_speed_max
-    J_low, J_high = cartesian_bounds(J, dJdq, state.dq, speed_max, plan.tcp_acceleration_max, dt_s)
-    twist, further = apply(J, state.dq), 1.0 + plan.smooth_s / dt_s
-    low, high, J_low, J_high = (
-        now + further * (bound - now)
-        for bound, now in ((low, state.dq), (high, state.dq), (J_low, twist), (J_high, twist))
-    )
-    limits = Limits(low, high, J, J_low, J_high)
-    if math.isfinite(target.tcp_speed_max):
-        within = tuple(state.dq + further * (bound - state.dq) for bound in axes)
-        limits = add_speed_row(limits, twist, further * dt_s * dJdq, target.tcp_speed_max, *within)
-    pairs = sight.pairs
-    if pairs is None:
-        raise ValueError("problem: the distances from people are not known")
-    rows = tick_rows(
-        pose,
-        obstacles,
-        pairs.constraint_rhs_m2(plan.constraint_rhs, plan.give_way_m),
-        pairs.distance_m,
-        horizon_s + plan.lead_s,
-        None if static is None else static.rows(pose, static_ahead_s(horizon_s, settings)),
-    )
-    return Problem(H, g, limits, rows, plan.rows == "soft")
+    weights = rules.q_p, rules.q_v, rules.path_gain_per_s, dt_s
+    H, g = tracking_cost(error, pose.J_tcp, pose.dJdq_tcp, now.dq, target.twist, *weights)
+    H, g = with_posture(H, g, now.q - target.q, rules.posture)
+    rhs_m2 = constraint_rhs(now.pairs, rules.square, rules.give_way_m)
+    _, planes = plane_rows(static, pose.ends_m, pose.J_ends, now.static_ahead_s)
+    hulls = now.vertices, now.offsets, now.boxes
+    rows = tick_rows(pose, *hulls, rhs_m2, now.pairs.distance_m, now.ahead_s, planes)
+    return Problem(H, g, _limits(arm, rules, now), rows, rules.soft)
+
+
+@njit(cache=True)
+def _limits(arm: Arm, rules: QpRules, now: Instant) -> Limits:
+    """The bounds of axes and TCP at one tick, Eq. (66d)-(66h), extended to those of the target velocity."""
+    pose, dq, dt_s = now.pose, now.dq, rules.dt_s
+    low, high = joint_bounds(now.q, dq, arm.q_min, arm.q_max, arm.dq_max, arm.ddq_max, dt_s)
+    further = 1.0 + rules.smooth_s / dt_s
+    least, most = dq + further * (low - dq), dq + further * (high - dq)
+    if rules.jerk_s > dt_s:
+        low, high = smooth_bounds(low, high, dq + dt_s * now.u_before, dt_s**2 / rules.jerk_s * arm.ddq_max)
+    acceleration_max, twist = rules.tcp_acceleration_max, pose.twist_tcp
+    J_low, J_high = cartesian_bounds(pose.J_tcp, pose.dJdq_tcp, dq, now.speed_max, acceleration_max, dt_s)
+    low, high = dq + further * (low - dq), dq + further * (high - dq)
+    J_low, J_high = twist + further * (J_low - twist), twist + further * (J_high - twist)
+    limits = Limits(low, high, pose.J_tcp, J_low, J_high)
+    if math.isfinite(now.target.tcp_speed_max):
+        drift = further * dt_s * pose.dJdq_tcp
+        limits = add_speed_row(limits, twist, drift, now.target.tcp_speed_max, least, most)
+    return limits
 
 
 def static_ahead_s(horizon_s: float, settings: PlanSettings) -> float:
@@ -328,34 +376,31 @@ def add_speed_row(limits: Limits, twist: Floats, drift: Floats, speed_max: float
     return Limits(limits.low, limits.high, np.concatenate((limits.J, row)), J_low, J_high)
 
 
-def limit_speed(
-    robot: RobotModel, state: RobotState, J: Floats, dq_next: Floats, speed_max: float, settings: PlanSettings
-) -> Floats:
+@njit(cache=True)
+def limit_speed(arm: Arm, rules: QpRules, now: Instant, dq_next: Floats) -> Floats:
     """Moves a proposed velocity towards that of the hardest braking until the TCP keeps its speed limit.
 
     The limit holds at the end of the tick, with the posture at that time. The TCP may already be faster, because a
     slower move begins or because of its stop; then it slows down with the time constant ``plan.smooth_s``.
 
     Args:
-        robot: The manipulator.
-        state: State of the robot at the tick.
-        J: (6, nv) Jacobian of the TCP at the tick [m/rad, rad/rad].
+        arm: The manipulator.
+        rules: Length of a tick, and the time constant.
+        now: State and reference of the tick.
         dq_next: (nv,) velocity proposed for the end of the tick [rad/s].
-        speed_max: Speed limit of the TCP [m/s].
-        settings: Length of a tick, and the time constant.
 
     Returns:
         (nv,) velocity at the end of the tick; ``dq_next`` itself if it keeps the limit [rad/s].
     """
+    speed_max, dt_s, J = now.target.tcp_speed_max, rules.dt_s, now.pose.J_tcp
     if not math.isfinite(speed_max):
         return dq_next
-    dt_s = settings.dt_s
-    now, _ = _speed_and_share(J, np.zeros(robot.nv), state.dq, 1.0, 0.0)
-    allowed = max(speed_max, now + (speed_max - now) / (1.0 + settings.plan.smooth_s / dt_s))
-    brake = np.copysign(np.maximum(np.abs(state.dq) - robot.ddq_max * dt_s, 0.0), state.dq)
+    present, _ = _speed_and_share(J, np.zeros_like(dq_next), now.dq, 1.0, 0.0)
+    allowed = max(speed_max, present + (speed_max - present) / (1.0 + rules.smooth_s / dt_s))
+    brake = np.copysign(np.maximum(np.abs(now.dq) - arm.ddq_max * dt_s, 0.0), now.dq)
     dq, share = dq_next, 1.0
     for _ in range(SPEED_ROUNDS):
-        J = robot.pose(state.q + 0.5 * dt_s * (state.dq + dq), dq).J_tcp
+        _, J = tcp_jacobian(arm.chain, axis_frames(arm.chain, now.q + 0.5 * dt_s * (now.dq + dq)))
         speed, less = _speed_and_share(J, brake, dq_next - brake, share, allowed)
         if speed <= allowed or less == share:
             break
@@ -381,10 +426,10 @@ def _speed_and_share(J: Floats, brake: Floats, way: Floats, share: float, allowe
     return math.sqrt(square), min(max(most, 0.0), 1.0)
 
 
-def dq_after(dq: Floats, aim: Floats, settings: PlanSettings) -> Floats:
+@njit(cache=True)
+def dq_after(dq: Floats, aim: Floats, rules: QpRules) -> Floats:
     """(nv,) velocity one tick later of a robot with velocity ``dq`` and target velocity ``aim`` [rad/s]."""
-    smooth_s = settings.plan.smooth_s
-    return dq + (aim - dq) / (1.0 + smooth_s / settings.dt_s) if smooth_s else aim
+    return dq + (aim - dq) / (1.0 + rules.smooth_s / rules.dt_s) if rules.smooth_s > 0.0 else aim
 
 
 @njit(cache=True)
@@ -404,6 +449,40 @@ def smooth_bounds(low: Floats, high: Floats, steady: Floats, change: Floats) -> 
     return near_low, near_high
 
 
+class Stops(NamedTuple):
+    """The step to a proposed velocity with two stops after it, as rows of ``Stop``."""
+
+    straight: tuple[Floats, Floats, Floats]
+    axis_by_axis: tuple[Floats, Floats, Floats]
+
+
+@njit(cache=True)
+def stops_after(arm: Arm, rules: QpRules, now: Instant, aim: Floats) -> Stops:
+    """The step towards a target velocity, Eq. (68), (69), and the stops after it.
+
+    Args:
+        arm: The manipulator.
+        rules: Length of a tick, and the time constant.
+        now: State and reference of the tick.
+        aim: (nv,) [rad/s].
+    """
+    dq_next = limit_speed(arm, rules, now, dq_after(now.dq, aim, rules))
+    q_next = now.q + 0.5 * rules.dt_s * (now.dq + dq_next)  # Eq. (68), (69)
+    return Stops(
+        straight(q_next, dq_next, arm.ddq_max, rules.dt_s), axis_by_axis(q_next, dq_next, arm.ddq_max, rules.dt_s)
+    )
+
+
+@njit(cache=True)
+def _propose(arm: Arm, rules: QpRules, now: Instant, static: StaticShapes) -> tuple[bool, bool, Stops]:
+    """Whether coordinate descent proves the minimiser of Eq. (66), whether a row holds it, and the stops after it."""
+    found = search(build(arm, rules, now, static))
+    if found.outcome != SOLVED:
+        none = np.empty((0, len(now.dq)))
+        return False, False, Stops((none, none, none), (none, none, none))
+    return True, found.held, stops_after(arm, rules, now, found.w)
+
+
 def propose(context: QpContext, settings: PlanSettings) -> Proposals:
     """One tick of Section 5: the best step by Eq. (66) and the stop after it; or the reason why there is none.
 
@@ -411,20 +490,19 @@ def propose(context: QpContext, settings: PlanSettings) -> Proposals:
         context: Robot, reference and people of the tick.
         settings: Weights and limits.
     """
-    robot, state, target, sight = context.robot, context.state, context.target, context.sight
-    task = problem(context, settings)
-    found = minimise(task)
-    if not isinstance(found, Solution) and settings.plan.jerk_s > 0.0:  # a limit may require a sudden change
-        found = minimise(problem(context, settings.without_jerk()))
-    if not isinstance(found, Solution):
-        if found.status == "not finite":
-            return control_step.NOT_FINITE
-        too_fast = settings.retreats(sight.overlap_m)  # too fast for a retreat
-        return control_step.INSIDE if too_fast else control_step.NO_SOLUTION
-    dq_next = dq_after(state.dq, found.dq_next, settings)
-    dq_next = limit_speed(robot, state, sight.pose.J_tcp, dq_next, target.tcp_speed_max, settings)
-    q_next = state.q + 0.5 * settings.dt_s * (state.dq + dq_next)  # Eq. (68), (69)
-    status = control_step.LIMITED if found.held else control_step.TRACKING
+    numbers = _numbers(context, settings)
+    solved, held, stops = _propose(*numbers)
+    if not solved:
+        found = minimise(build(*numbers))
+        if not isinstance(found, Solution) and settings.plan.jerk_s > 0.0:  # a limit may require a sudden change
+            found = minimise(problem(context, settings.without_jerk()))
+        if not isinstance(found, Solution):
+            if found.status == "not finite":
+                return control_step.NOT_FINITE
+            too_fast = settings.retreats(context.sight.overlap_m)  # too fast for a retreat
+            return control_step.INSIDE if too_fast else control_step.NO_SOLUTION
+        held, stops = found.held, stops_after(*numbers[:3], found.dq_next)
+    status = control_step.LIMITED if held else control_step.TRACKING
     # a straight stop may leave the range of an axis, a stop by Eq. (67) does not
-    stops = (stop_straight, stop_axis_by_axis) if settings.certified else (stop_axis_by_axis,)
-    return [Proposal(stop(q_next, dq_next, robot.ddq_max, settings.dt_s), status) for stop in stops]
+    rows = stops if settings.certified else stops[1:]
+    return [Proposal(Stop(*stop), status) for stop in rows]

@@ -54,7 +54,7 @@ class RecordedMotion:
             q=q,
             dq=dq,
             tcp_m=sight.pose.T_world_tcp[:3, 3],
-            tcp_speed=sight.pose.tcp_speed(dq),
+            tcp_speed=sight.pose.tcp_speed,
             distance_m=sight.distance_m,
             overlap_m=math.nan if math.isnan(sight.distance_m) else sight.overlap_m,
             limb=sight.limb,

@@ -17,7 +17,7 @@ from hrcreplay.geometry.distances import distances
 from hrcreplay.geometry.vectors import dot3
 from hrcreplay.kernels import njit
 from hrcreplay.records import Floats, Ints, SweptVolumes
-from hrcreplay.robot.model import RobotPose
+from hrcreplay.robot.kinematics import RobotPose
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,8 +89,7 @@ def boxes(vertices: Floats, offsets: Ints, radius: Floats) -> tuple[Floats, bool
     return found, known
 
 
-@dataclass(frozen=True, slots=True)
-class Separation:
+class Separation(NamedTuple):
     """Distances between the axes of the links and the hulls of the limbs in one tick."""
 
     distance_m: Floats  #: (s, l) proven lower bound, tight to rounding, 0 in penetration [m]
@@ -105,31 +104,56 @@ class Separation:
             give_way_m: For ``product``: if the gap to a volume is smaller than this, the right-hand side is negative
                 and the link must move away [m].
         """
-        gap = self.distance_m - self.clearance_m
-        if form == "square":
-            return np.asarray(np.maximum(0.0, gap) ** 2)
-        return np.asarray(self.distance_m * (np.maximum(0.0, gap) - give_way_m))
-
-    def nearest(self) -> tuple[float, int, int]:
-        """Smallest distance between surfaces, negative if they overlap, NaN if any is NaN [m]; its link and limb."""
-        surface = self.distance_m - self.clearance_m
-        link, limb = divmod(int(np.argmin(surface)), surface.shape[1])
-        return float(surface[link, limb]), link, limb
+        return constraint_rhs(self, form == "square", give_way_m)
 
 
-def separation(pose: RobotPose, obstacles: Obstacles, clearance_m: Floats) -> Separation:
-    """Proven lower bounds of the distances of all pairs.
+@njit(cache=True)
+def constraint_rhs(pairs: Separation, square: bool, give_way_m: float) -> Floats:
+    """Computes the right-hand side of Eq. (14), corrected; see ``Separation.constraint_rhs_m2`` [m^2]."""
+    found = np.empty_like(pairs.distance_m)
+    for s in range(found.shape[0]):
+        for k in range(found.shape[1]):
+            room = max(0.0, pairs.distance_m[s, k] - pairs.clearance_m[s, k])  # Eq. (6), (10)
+            found[s, k] = room * room if square else pairs.distance_m[s, k] * (room - give_way_m)
+    return found
+
+
+class NearestLink(NamedTuple):
+    """Distances of all pairs, and the pair whose surfaces are nearest."""
+
+    pairs: Separation
+    surface_m: float  #: distance between the surfaces, negative if they overlap; NaN without a pair or if any is [m]
+    link: int  #: -1 without a pair
+    limb: int  #: -1 without a pair
+
+
+@njit(cache=True)
+def measure(
+    ends: Floats, link_radius: Floats, vertices: Floats, offsets: Ints, radius: Floats, clearance_m: float
+) -> NearestLink:
+    """Proven lower bounds of the distances of all pairs, and the nearest pair.
 
     A plane between link and limb bounds their distance from below, even if the search for the distance has not
     converged. Thus every pair has a bound; without convergence the bound is only less tight.
 
     Args:
-        pose: The robot.
-        obstacles: The swept volumes, all known.
-        clearance_m: (s, l) Delta of Eq. (2) for every pair of link and limb [m].
+        ends: (s, 2, 3) ends of the links' axes [m].
+        link_radius: (s,) [m].
+        vertices: (m, 3) of all limbs, which are known [m].
+        offsets: (l + 1,) index of each limb's first vertex.
+        radius: (l,) of the limbs' balls [m].
+        clearance_m: Clearance beyond limb radius + link radius [m].
     """
-    low, _, _ = distances(pose.ends_m, obstacles.vertices_m, obstacles.offsets)
-    return Separation(low, clearance_m)
+    low, _, _ = distances(ends, vertices, offsets)
+    clearance = np.empty_like(low)
+    surface, link, limb = np.inf if low.size else np.nan, -1, -1
+    for s in range(low.shape[0]):
+        for k in range(low.shape[1]):
+            clearance[s, k] = link_radius[s] + radius[k] + clearance_m
+            gap = low[s, k] - clearance[s, k]
+            if gap < surface or (math.isnan(gap) and not math.isnan(surface)):
+                surface, link, limb = gap, s, k
+    return NearestLink(Separation(low, clearance), surface, link, limb)
 
 
 class Approach(NamedTuple):
@@ -163,28 +187,46 @@ def no_planes(nv: int) -> PlaneRows:
     return PlaneRows(np.empty((0, nv)), np.empty(0))
 
 
+@njit(cache=True)
 def tick_rows(
     pose: RobotPose,
-    obstacles: Obstacles,
+    vertices: Floats,
+    offsets: Ints,
+    boxes_m: Floats,
     rhs_m2: Floats,
     distance_m: Floats,
     stop_s: float,
-    planes: PlaneRows | None = None,
+    planes: PlaneRows,
 ) -> Approach:
     """The data of the approach rows of a tick; the rows themselves are not computed.
 
     Args:
         pose: The robot.
-        obstacles: The swept volumes, all known.
+        vertices: (m, 3) of all limbs, which are known [m].
+        offsets: (l + 1,) index of each limb's first vertex.
+        boxes_m: (l, 2, 3) boxes around the limbs' vertices [m].
         rhs_m2: (s, l) right-hand side of Eq. (14) for every pair of link and limb [m^2].
         distance_m: (s, l) between the link's axis and the limb's hull [m].
         stop_s: T_s of Eq. (70), or the time that the rows look ahead [s].
-        planes: Rows of what stands in the cell; None: there is nothing.
+        planes: Rows of what stands in the cell.
     """
     per_speed = stop_s * np.maximum(distance_m, _LEAST_M)
+    around = vertices, offsets, boxes_m
+    return Approach(pose.ends_m, pose.J_ends, *around, rhs_m2, per_speed, stop_s, planes.A, planes.high)
+
+
+def rows_of_people(pose: RobotPose, obstacles: Obstacles, pairs: Separation, rhs_m2: Floats, stop_s: float) -> Approach:
+    """The data of the approach rows of people alone; see ``tick_rows``.
+
+    Args:
+        pose: The robot.
+        obstacles: The swept volumes, all known.
+        pairs: Distances of all pairs of link and limb.
+        rhs_m2: (s, l) right-hand side of Eq. (14) for every pair of link and limb [m^2].
+        stop_s: T_s of Eq. (70), or the time that the rows look ahead [s].
+    """
     around = obstacles.vertices_m, obstacles.offsets, obstacles.boxes_m
-    planes = no_planes(pose.J_tcp.shape[1]) if planes is None else planes
-    return Approach(pose.ends_m, pose.J_ends, *around, rhs_m2, per_speed, stop_s, *planes)
+    return tick_rows(pose, *around, rhs_m2, pairs.distance_m, stop_s, no_planes(pose.J_tcp.shape[1]))
 
 
 @njit(cache=True)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -24,7 +25,7 @@ from hrcreplay.geometry.vectors import dot3
 from hrcreplay.kernels import njit
 from hrcreplay.records import Bools, Floats, Ints
 from hrcreplay.robot.control.separation import PlaneRows, boxes
-from hrcreplay.robot.model import RobotModel, RobotPose
+from hrcreplay.robot.model import RobotModel
 
 #: Rows keep this much more distance than the certificate, so that the certificate lets a robot turn back that has come
 #: as near as the rows allow [m].
@@ -47,7 +48,27 @@ class StaticHull(NamedTuple):
     programme_may_touch: bool = False  #: whether a programme that touches it is planned all the same
 
 
-@dataclass(frozen=True, slots=True)
+class StaticShapes(NamedTuple):
+    """Hulls and pairs of links as numbers for kernels; shapes as in ``StaticObstacles``."""
+
+    vertices: Floats
+    offsets: Ints
+    boxes: Floats
+    keep: Floats
+    pairs: Ints
+    pair_keep: Floats
+    pair_reach: Floats
+
+
+def no_shapes(links: int, axes: int) -> StaticShapes:
+    """Nothing to keep clear of beside people, for a robot with so many links and axes."""
+    vertices, pairs = np.empty((0, 3)), np.empty((0, 2), np.int64)
+    vertices.setflags(write=False)
+    hulls = vertices, np.zeros(1, np.int64), np.empty((0, 2, 3)), np.empty((links, 0))
+    return StaticShapes(*hulls, pairs, np.empty(0), np.empty((axes, 0)))
+
+
+@dataclass(frozen=True)
 class StaticObstacles:
     """The objects of a cell and the pairs of links of one robot that are kept apart."""
 
@@ -64,15 +85,13 @@ class StaticObstacles:
     pair_reach_m: Floats  #: (nv, p) largest distance from an axis that turns one of the two against the other [m]
     notes: tuple[str, ...]  #: on pairs that are not checked, or not at the full distance, and on the programme
 
-    def rows(self, pose: RobotPose, ahead_s: float) -> PlaneRows:
-        """The rows of objects and links at a pose.
-
-        Args:
-            pose: The robot.
-            ahead_s: Time that the rows look ahead [s].
-        """
-        _, A, high = plane_rows(self, pose, ahead_s)
-        return PlaneRows(A, high)
+    @cached_property
+    def shapes(self) -> StaticShapes:
+        """Hulls and pairs of links as numbers for kernels."""
+        vertices = self.vertices_m.view()
+        vertices.setflags(write=False)  # like those of people; otherwise numba compiles all kernels again
+        hulls = vertices, self.offsets, self.boxes_m, self.keep_m
+        return StaticShapes(*hulls, self.pairs, self.pair_keep_m, self.pair_reach_m)
 
 
 def static_obstacles(
@@ -125,7 +144,7 @@ def pair_reach(robot: RobotModel, pairs: Ints) -> Floats:
 
 def link_radii(robot: RobotModel) -> Floats:
     """(s,) radii of the links [m]."""
-    return np.array([segment.radius_m for segment in robot.segments])
+    return robot.arm.radius_m
 
 
 def half_space(robot: RobotModel, point_m: Floats, normal: Floats) -> Floats:
@@ -149,36 +168,32 @@ def half_space(robot: RobotModel, point_m: Floats, normal: Floats) -> Floats:
     return np.array([*corners, *(corner - thick_m * normal for corner in corners)])
 
 
-def plane_rows(static: StaticObstacles, pose: RobotPose, ahead_s: float) -> tuple[Ints, Floats, Floats]:
+@njit(cache=True)
+def plane_rows(static: StaticShapes, ends: Floats, J_ends: Floats, ahead_s: float) -> tuple[Ints, PlaneRows]:
     """The rows of objects and links at a pose, and what each is of.
 
     Args:
         static: Objects and pairs of links.
-        pose: The robot.
+        ends: (s, 2, 3) ends of the links [m].
+        J_ends: (s, 2, 3, nv) their position Jacobians [m/rad].
         ahead_s: Time that the rows look ahead [s].
 
     Returns:
         For n rows: (n, 4) link, its end, hull or -1, and for a pair of links the other link times two plus its end;
-        (n, nv) [m/rad]; (n,) largest speed [m/s].
+        and the rows.
     """
-    of_objects = _object_rows(
-        pose.ends_m, pose.J_ends, static.vertices_m, static.offsets, static.boxes_m, static.keep_m, ahead_s
-    )
-    if not len(static.pairs):
-        return of_objects
-    of_links = _link_rows(pose.ends_m, pose.J_ends, static.pairs, static.pair_keep_m, ahead_s)
-    which, A, high = (np.concatenate(both) for both in zip(of_objects, of_links, strict=True))
-    return which, A, high
+    objects, A, high = _object_rows(ends, J_ends, static, ahead_s)
+    links, B, low = _link_rows(ends, J_ends, static.pairs, static.pair_keep, ahead_s)
+    return np.concatenate((objects, links)), PlaneRows(np.concatenate((A, B)), np.concatenate((high, low)))
 
 
 @njit(cache=True)
-def _object_rows(
-    ends: Floats, J_ends: Floats, vertices: Floats, offsets: Ints, around: Floats, keep: Floats, ahead_s: float
-) -> tuple[Ints, Floats, Floats]:
+def _object_rows(ends: Floats, J_ends: Floats, static: StaticShapes, ahead_s: float) -> tuple[Ints, Floats, Floats]:
+    vertices, offsets, keep = static.vertices, static.offsets, static.keep
     links, hulls = keep.shape
     which, A, high = _no_rows(2 * links * hulls, J_ends.shape[3])
     n = 0
-    low, normals = separating_planes(ends, vertices, offsets, _within(ends, around, keep, ROWS_WITHIN_M))
+    low, normals = separating_planes(ends, vertices, offsets, _within(ends, static.boxes, keep, ROWS_WITHIN_M))
     for s in range(links):
         for k in range(hulls):
             normal = normals[s, k]

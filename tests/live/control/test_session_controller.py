@@ -20,7 +20,8 @@ from hrcreplay.logs.cleaning import PersonMemory
 from hrcreplay.logs.skeleton_pb2 import Skeleton
 from hrcreplay.records import STATUSES, CameraFrames, Floats, HumanStates
 from hrcreplay.robot.control.controllers import QpController
-from hrcreplay.robot.model import RobotModel, RobotPose
+from hrcreplay.robot.kinematics import RobotPose
+from hrcreplay.robot.model import RobotModel
 from tests.live.flights import BEGIN_NS, CYCLE_S, Flight, far_away, is_a_stop, start, steps_keep_the_limits
 from tests.tools.campaign import violations
 
@@ -166,7 +167,7 @@ def test_a_robot_waits_for_few_poses_when_it_sets_out(monkeypatch: pytest.Monkey
     monkeypatch.undo()
     assert way is not None
     path = way.reference
-    fastest = max(setup.robot.pose(q, dq).tcp_speed(dq) for q, dq in zip(path.q, path.dq, strict=True))
+    fastest = max(setup.robot.pose(q, dq).tcp_speed for q, dq in zip(path.q, path.dq, strict=True))
     assert fastest <= path.tcp_speed_max[0] <= 1.5 * fastest
 
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hrcreplay.records import Floats
 from hrcreplay.robot.control.control_step import RobotState
 from hrcreplay.robot.control.qp_controller import RAD_PER_M, cartesian_bounds, joint_bounds
-from hrcreplay.robot.control.separation import obstacles, tick_rows, worst_rows
+from hrcreplay.robot.control.separation import Separation, obstacles, rows_of_people, worst_rows
 from hrcreplay.robot.model import RobotModel, irb140
 from tests.robot.distances import by_coal
 from tests.robot.people import cloud, volumes
@@ -58,7 +58,15 @@ def test_worst_rows_are_the_worst_of_all_rows(robot: RobotModel) -> None:
         seen = obstacles(volumes(limbs), 0)
         distance = by_coal(pose, seen)
         which, A, values = worst_rows(
-            tick_rows(pose, seen, np.maximum(0.0, distance - 0.1) ** 2, distance, STOP_S), dq, 0.0
+            rows_of_people(
+                pose,
+                seen,
+                Separation(distance, np.full_like(distance, 0.1)),
+                np.maximum(0.0, distance - 0.1) ** 2,
+                STOP_S,
+            ),
+            dq,
+            0.0,
         )
         found = {
             tuple(key[:3]): (key[3], row, value) for key, row, value in zip(which.tolist(), A, values, strict=True)

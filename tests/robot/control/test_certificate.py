@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.optimize import nnls
 
 from hrcreplay.records import Floats
 from hrcreplay.robot.control import certificate
-from hrcreplay.robot.control.certificate import CLEAR, NO_PLANES, REFUSED, clear, separating_normal
+from hrcreplay.robot.control.certificate import CLEAR, NO_PLANES, REFUSED, check, clear, separating_normal
 from hrcreplay.robot.control.control_step import RobotState, Stop, at_rest, observe, stop_axis_by_axis, stop_straight
-from hrcreplay.robot.control.separation import tick_rows, worst_rows
+from hrcreplay.robot.control.separation import rows_of_people, worst_rows
 from hrcreplay.robot.model import RobotModel, irb140
 from tests.tools.random_stops import DT_S, TOOL_M, Box, as_obstacles, deepest_m, link_points, random_step, run
 
@@ -49,7 +51,7 @@ def test_the_stop_that_the_rows_allow_and_that_enters_is_refused(robot: RobotMod
     sight = observe(robot, RobotState(q, FAST), seen, 0.0)
     assert sight.pairs is not None
     assert sight.distance_m == pytest.approx(0.03, abs=1e-3)
-    rows = tick_rows(sight.pose, seen, sight.pairs.constraint_rhs_m2("square"), sight.pairs.distance_m, 0.377)
+    rows = rows_of_people(sight.pose, seen, sight.pairs, sight.pairs.constraint_rhs_m2("square"), 0.377)
     assert not len(worst_rows(rows, FAST, 0.0)[0]), "all rows hold"
     assert np.all(np.abs(FAST) <= robot.dq_max)
     going = Stop(q[None], FAST[None], np.full((1, 2), np.nan))
@@ -84,6 +86,38 @@ def test_what_is_not_known_or_not_finite_is_refused(robot: RobotModel) -> None:
     assert not clear(robot, at_rest(q), at_rest(beyond), far, 0.0, DT_S, NO_PLANES)[0]
 
 
+def unsearched(*given: Any) -> Any:
+    """The check as if the search for planes had found none: every pair is left to coal."""
+    done, course, planes, people, beside = check(*given)
+    links, limbs = planes.shape[:2]
+    every = np.array([(link, limb) for link in range(links) for limb in range(limbs)])
+    people = people._replace(pairs=every, results=np.full(len(every), certificate.OPEN))
+    return done, course, np.zeros_like(planes), people, beside
+
+
+def test_coal_finds_the_planes_that_the_search_does_not(robot: RobotModel, monkeypatch: pytest.MonkeyPatch) -> None:
+    rng, verdicts, calls = np.random.default_rng(9), [], [0]
+    really = certificate.separating_normal
+
+    def counted(*given: Any) -> Any:
+        calls[0] += 1
+        return really(*given)
+
+    monkeypatch.setattr(certificate, "separating_normal", counted)
+    for _ in range(150):
+        going, stop = random_step(rng, robot, together=bool(rng.integers(2)))
+        near = as_obstacles([_ball(link_points(stop.q[-1:])[0, 3, -1] + rng.normal(size=3) * 0.15)])
+        monkeypatch.setattr(certificate, "check", check)
+        calls[0] = 0
+        searched = clear(robot, going, stop, near, 0.0, DT_S, NO_PLANES)[0]
+        assert calls[0] == 0, "what the search proves or refutes needs no coal"
+        monkeypatch.setattr(certificate, "check", unsearched)
+        verdicts.append((searched, clear(robot, going, stop, near, 0.0, DT_S, NO_PLANES)[0]))
+    found, by_coal = np.array(verdicts).T
+    assert np.mean(found == by_coal) > 0.97, "they differ only where a stop is hardly clear"
+    assert 0.2 < np.mean(found == CLEAR) < 0.9
+
+
 @pytest.mark.parametrize("error", [RuntimeError, ValueError])
 def test_where_coal_fails_the_motion_is_refused(
     robot: RobotModel, monkeypatch: pytest.MonkeyPatch, error: type[Exception]
@@ -99,6 +133,8 @@ def test_where_coal_fails_the_motion_is_refused(
         raise error("GJK did not converge")
 
     monkeypatch.setattr(certificate, "_gjk", fails)
+    assert clear(robot, at_rest(q), at_rest(q), near, 0.0, DT_S, NO_PLANES)[0], "the search needs no coal"
+    monkeypatch.setattr(certificate, "check", unsearched)
     assert not clear(robot, at_rest(q), at_rest(q), near, 0.0, DT_S, NO_PLANES)[0]
 
 

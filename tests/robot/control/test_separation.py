@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,7 +12,7 @@ from scipy.optimize import nnls
 from hrcreplay.geometry.distances import EXACT_M, distances
 from hrcreplay.records import Floats
 from hrcreplay.robot.control import separation as module
-from hrcreplay.robot.control.separation import obstacles, separation
+from hrcreplay.robot.control.separation import NearestLink, Obstacles, measure, obstacles
 from tests.robot.distances import axis_distance, by_coal
 from tests.robot.people import cloud, volumes
 
@@ -26,6 +27,10 @@ def nearest_of_hull(vertices: Floats, a: Floats, b: Floats) -> float:
 
 def arm(*segments: Floats) -> Any:
     return SimpleNamespace(ends_m=np.array(segments))
+
+
+def measured(pose: Any, seen: Obstacles, radius: Floats, clearance_m: float) -> NearestLink:
+    return measure(pose.ends_m, radius, seen.vertices_m, seen.offsets, seen.radius_m, clearance_m)
 
 
 SHAPES: dict[str, Callable[[np.random.Generator], Floats]] = {
@@ -101,9 +106,10 @@ def test_the_nearest_pair_is_that_of_all_distances() -> None:
     for _ in range(60):
         limbs = [cloud(rng, 30, rng.uniform(0.02, 0.3, 3)) + rng.normal(size=3) * 0.7 for _ in range(6)]
         seen, pose = obstacles(volumes(limbs), 0), arm(*rng.normal(size=(5, 2, 3)) * 0.4)
-        clearance = rng.uniform(0.1, 0.3, (5, 6))
-        surface, link, limb = separation(pose, seen, clearance).nearest()
-        expected = by_coal(pose, seen) - clearance
+        radius, ball = rng.uniform(0.05, 0.1, 5), rng.uniform(0.0, 0.2, 6)
+        ball.flags.writeable = False  # as radii are: so the kernel is that of a run
+        _, surface, link, limb = measured(pose, replace(seen, radius_m=ball), radius, 0.05)
+        expected = by_coal(pose, seen) - radius[:, None] - ball - 0.05
         assert link * 6 + limb == np.argmin(expected)
         assert surface == pytest.approx(expected.min(), abs=1e-10)
 
@@ -133,6 +139,7 @@ def test_a_pair_whose_bounds_do_not_meet_counts_with_the_lower_one(monkeypatch: 
         return low - 0.1, high + 0.1, near
 
     monkeypatch.setattr(module, "distances", open_ended)
-    found = separation(pose, seen, np.zeros((1, 2)))
-    np.testing.assert_allclose(found.distance_m, np.sqrt([[3.0, 12.0]]) - 0.1, rtol=0, atol=1e-12)
-    assert found.nearest() == pytest.approx((np.sqrt(3.0) - 0.1, 0, 0))
+    seen = replace(seen, radius_m=np.zeros(2))
+    found = measure.py_func(pose.ends_m, np.zeros(1), seen.vertices_m, seen.offsets, seen.radius_m, 0.0)
+    np.testing.assert_allclose(found.pairs.distance_m, np.sqrt([[3.0, 12.0]]) - 0.1, rtol=0, atol=1e-12)
+    assert found[1:] == pytest.approx((np.sqrt(3.0) - 0.1, 0, 0))

@@ -22,7 +22,7 @@ from hrcreplay.robot.control.qp_controller import QpContext, Target, problem, pr
 from hrcreplay.robot.control.separation import obstacles
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.path import approach, smooth_recorded
-from hrcreplay.robot.task import Reference, tcp_speed_cap
+from hrcreplay.robot.task import Reference, tcp_speed_cap, waits
 from hrcreplay.settings.sections import Plan
 from tests.robot.checker import links
 from tests.robot.people import cloud, volumes
@@ -170,11 +170,11 @@ def test_each_move_has_the_limit_that_the_task_gives_it(path: Reference) -> None
 
 def test_what_a_robot_may_reach(path: Reference) -> None:
     rack_s = path.waypoints_s[1]
-    assert tcp_speed_cap(path, 0.5 * rack_s, Plan()) == 0.25
-    assert tcp_speed_cap(path, 0.5 * rack_s, Plan(catch_up_speed_m_per_s=0.4)) == 0.4
-    assert tcp_speed_cap(path, 0.5 * rack_s, Plan(catch_up_speed_m_per_s=0.1)) == 0.25
-    assert tcp_speed_cap(path, 0.5 * rack_s, Plan(catch_up_speed_m_per_s="free")) == np.inf
-    assert tcp_speed_cap(path, 0.5 * rack_s, Plan(reference="time")) == 1.0  # the robot may be on any move
+    assert tcp_speed_cap(path.grid, 0.5 * rack_s, waits(Plan())) == 0.25
+    assert tcp_speed_cap(path.grid, 0.5 * rack_s, waits(Plan(catch_up_speed_m_per_s=0.4))) == 0.4
+    assert tcp_speed_cap(path.grid, 0.5 * rack_s, waits(Plan(catch_up_speed_m_per_s=0.1))) == 0.25
+    assert tcp_speed_cap(path.grid, 0.5 * rack_s, waits(Plan(catch_up_speed_m_per_s="free"))) == np.inf
+    assert tcp_speed_cap(path.grid, 0.5 * rack_s, waits(Plan(reference="time"))) == 1.0  # the robot may be on any move
 
 
 def test_a_path_without_a_task_has_its_own_greatest_speed(robot: RobotModel) -> None:

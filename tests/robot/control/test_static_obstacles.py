@@ -13,8 +13,9 @@ from hrcreplay.records import Floats
 from hrcreplay.robot.control.active_constraints import explain_refusal, find_holding_rows, name_planes
 from hrcreplay.robot.control.certificate import CLEAR, NO_PLANES, REFUSED, clear
 from hrcreplay.robot.control.control_step import PlanSettings, Proposal, RobotState, at_rest, observe, stop_straight
-from hrcreplay.robot.control.minimiser import SLACK, Solution, minimise
+from hrcreplay.robot.control.minimiser import Solution, minimise
 from hrcreplay.robot.control.qp_controller import QpContext, Target, problem, static_ahead_s
+from hrcreplay.robot.control.row_search import SLACK
 from hrcreplay.robot.control.separation import Obstacles
 from hrcreplay.robot.control.static_obstacles import (
     ROWS_KEEP_M,
@@ -75,7 +76,7 @@ def test_rows_beside_a_floor_are_the_speed_of_the_ends_towards_it(robot: RobotMo
         pose = robot.pose(q, dq)
         low = float((pose.ends_m[:, :, 2].min(axis=1) - link_radii(robot)).min())
         static = floor(robot, low - 0.05, clearance_m)
-        which, A, high = plane_rows(static, pose, AHEAD_S)
+        which, (A, high) = plane_rows(static.shapes, pose.ends_m, pose.J_ends, AHEAD_S)
         assert len(which)
         sinks = -(robot.ends_m(q + h * dq) - robot.ends_m(q - h * dq))[:, :, 2] / (2 * h)
         gap = pose.ends_m[:, :, 2] - (low - 0.05) - link_radii(robot)[:, None] - clearance_m - ROWS_KEEP_M
@@ -99,7 +100,7 @@ def test_rows_of_two_links_are_the_speed_of_one_towards_the_other(robot: RobotMo
     h = 1e-6
     for q, dq in postures(robot, 10, 2):
         pose, static = robot.pose(q, dq), as_static(robot, [])
-        which, A, high = plane_rows(static, pose, AHEAD_S)
+        which, (A, high) = plane_rows(static.shapes, pose.ends_m, pose.J_ends, AHEAD_S)
         before, after = robot.ends_m(q - h * dq), robot.ends_m(q + h * dq)
         for (one, e, hull, other), row, bound in zip(which.tolist(), A, high, strict=True):
             two, f = divmod(other, 2)
@@ -183,7 +184,8 @@ def test_an_unchecked_pair_is_neither_certified_nor_bounded(robot: RobotModel) -
     stop, far = at_rest(q), as_obstacles([Box(np.array([5.0, 0.0, 0.0]), np.eye(3), np.zeros(3), 0.1)])
     assert clear(robot, stop, stop, far, 0.0, DT_S, NO_PLANES, static=checked)[0] == REFUSED
     assert clear(robot, stop, stop, far, 0.0, DT_S, NO_PLANES, static=unchecked)[0] == CLEAR
-    which, _, _ = plane_rows(unchecked, robot.pose(q, q), AHEAD_S)
+    pose = robot.pose(q, q)
+    which, _ = plane_rows(unchecked.shapes, pose.ends_m, pose.J_ends, AHEAD_S)
     assert set(which[:, 0].tolist()) <= {0, 1, 2}
 
 
@@ -232,7 +234,7 @@ def test_the_minimiser_keeps_the_rows_of_planes_as_another_solver_does(robot: Ro
         task = problem(context, settings)
         found = minimise(task)
         assert isinstance(found, Solution)
-        _, A, high = plane_rows(static, pose, static_ahead_s(0.1, settings))
+        _, (A, high) = plane_rows(static.shapes, pose.ends_m, pose.J_ends, static_ahead_s(0.1, settings))
         H, g = task.H, task.g
         limits = np.vstack([np.eye(6), task.limits.J]), np.append(task.limits.high, task.limits.J_high)
         below = np.append(task.limits.low, task.limits.J_low)
@@ -260,7 +262,8 @@ def test_why_names_the_object_that_holds_the_robot(robot: RobotModel) -> None:
     task = problem(context, settings)
     solved = minimise(task)
     assert isinstance(solved, Solution)
-    which, _, _ = plane_rows(static, context.sight.pose, 1.0)
+    pose = context.sight.pose
+    which, _ = plane_rows(static.shapes, pose.ends_m, pose.J_ends, 1.0)
     found = name_planes(find_holding_rows(task, solved), which, static)
     (row,) = found["binding"]
     link, end = divmod(int(np.argmin((ends[:, :, 2] - link_radii(robot)[:, None])[2:])) + 4, 2)
