@@ -32,7 +32,9 @@ from hrcreplay.logs.reader import open_log
 from hrcreplay.pipeline import assembly
 from hrcreplay.pipeline.run_config import RunConfig, recorded_limits, resolve, resolve_without_log
 from hrcreplay.records import AxisFrame, Floats, Ints
-from hrcreplay.robot.control.controllers import Controller
+from hrcreplay.robot.control import certificate, qp_controller
+from hrcreplay.robot.control.control_step import RobotState
+from hrcreplay.robot.control.controllers import Controller, QpController
 from hrcreplay.robot.control.minimiser import compile_second_tries
 from hrcreplay.robot.control.static_obstacles import StaticObstacles
 from hrcreplay.robot.model import RobotModel
@@ -314,6 +316,19 @@ def compile_kernels(start: dict[str, Any]) -> None:
         if perception is not None:
             codec.encode_perception(perception, len(seen))
             codec.encode_volumes(perception)
+    _compile_second_tries(controller)
+
+
+def _compile_second_tries(controller: SessionController) -> None:
+    """Compiles what a session needs after a crash, an echo or an unproven solution, with the person of the session."""
+    setup, perception = controller.setup, controller.perception
+    certificate.compile_second_tries(setup.robot)
+    setup.stop_from(RobotState(setup.programme.q0, np.zeros(setup.robot.nv)))
+    follower = setup.follow(setup.programme, 0.0)
+    if isinstance(follower, QpController) and perception is not None:
+        seen = follower.observe(lambda _: perception.obstacles)
+        if seen.sight.pairs is not None:
+            qp_controller.compile_second_tries(follower.qp_context(seen), follower.settings)
 
 
 def _seen(camera: str, to_camera: Floats, place_m: Floats, t_ns: int, body: int) -> bytes:

@@ -567,6 +567,17 @@ def _gap(a: Floats, b: Floats, normal: Floats, vertices: Floats) -> float:
     return depth - back
 
 
+def compile_second_tries(robot: RobotModel) -> None:
+    """Compiles the kernels that run only where ``check`` leaves a pair unproven, so that no session compiles them."""
+    q, far = np.zeros((2, robot.nv)), np.full((1, 3), 100.0)
+    far.setflags(write=False)  # as vertices are
+    course = Course(q, q, np.empty((0, 0, 2, 3)), travel_of(q, q, robot.axis_reach_m, 1.0))
+    if len(robot.segments):
+        _keeps_off(robot.arm.chain, course, 0, far, course.travel[0], 0.0, np.zeros(3))
+        motion = robot.link_motion(q, q)
+        _moves_away(motion.ends_m[:, 0], motion.twist[:, 0], far)
+
+
 def separating_normal(a: Floats, b: Floats, vertices_m: Floats) -> Floats | None:
     """Direction along which a segment and the convex hull of points are furthest apart, by coal's GJK.
 

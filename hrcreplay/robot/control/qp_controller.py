@@ -475,12 +475,19 @@ def stops_after(arm: Arm, rules: QpRules, now: Instant, aim: Floats) -> Stops:
 
 @njit(cache=True)
 def _propose(arm: Arm, rules: QpRules, now: Instant, static: StaticShapes) -> tuple[bool, bool, Stops]:
-    """Whether coordinate descent proves the minimiser of Eq. (66), whether a row holds it, and the stops after it."""
+    """Whether ``row_search`` proves the minimiser of Eq. (66), whether a row holds it, and the stops after it."""
     found = search(build(arm, rules, now, static))
     if found.outcome != SOLVED:
         none = np.empty((0, len(now.dq)))
         return False, False, Stops((none, none, none), (none, none, none))
     return True, found.held, stops_after(arm, rules, now, found.w)
+
+
+def compile_second_tries(context: QpContext, settings: PlanSettings) -> None:
+    """Compiles the kernels that run only where ``row_search`` proves no solution; see ``propose``."""
+    numbers = _numbers(context, settings)
+    build(*numbers)
+    stops_after(*numbers[:3], np.zeros_like(context.state.dq))
 
 
 def propose(context: QpContext, settings: PlanSettings) -> Proposals:
