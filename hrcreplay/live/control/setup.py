@@ -326,7 +326,7 @@ def _compile_second_tries(controller: SessionController) -> None:
     setup.stop_from(RobotState(setup.programme.q0, np.zeros(setup.robot.nv)))
     follower = setup.follow(setup.programme, 0.0)
     if isinstance(follower, QpController) and perception is not None:
-        seen = follower.observe(lambda _: perception.obstacles)
+        seen = follower.observe(lambda horizon_s: controller.observer.around(perception, horizon_s, believed=True))
         if seen.sight.pairs is not None:
             qp_controller.compile_second_tries(follower.qp_context(seen), follower.settings)
 
