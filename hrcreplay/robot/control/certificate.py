@@ -240,16 +240,18 @@ def check(
         static: Objects of the cell and pairs of links.
 
     Returns:
-        False if the motion cannot be done or ends outside the range of an axis; the motion; the planes for the next
-        tick; the unproven pairs of links and limbs; and those of links and objects, then pairs of links.
+        False if a number is not finite, or the motion cannot be done or ends outside the range of an axis; the motion;
+        the planes for the next tick; the unproven pairs of links and limbs; and those of links and objects, then pairs
+        of links.
     """
     q, dq = np.concatenate((q_now[:1], q_stop)), np.concatenate((dq_now[:1], dq_stop))
     links, limbs, objects = len(arm.radius_m), len(radius), static.keep.shape[1]
-    known = planes.shape[0] == links and planes.shape[1] == limbs + objects
-    planes = planes.copy() if known else np.zeros((links, limbs + objects, 3))
+    remembered = planes.shape[0] == links and planes.shape[1] == limbs + objects
+    planes = planes.copy() if remembered else np.zeros((links, limbs + objects, 3))
     course = Course(q, dq, np.full((len(q), links, 2, 3), np.nan), travel_of(q, dq, arm.axis_reach_m, dt_s))
-    done = bool(np.all((arm.q_min <= q[-1]) & (q[-1] <= arm.q_max)))
-    if not (done and _can_be_done(q, dq, arm.ddq_max * dt_s, dt_s)):
+    within = bool(np.all((arm.q_min <= q[-1]) & (q[-1] <= arm.q_max)))
+    known = math.isfinite(vertices.sum() + boxes.sum() + radius.sum())
+    if not (within and known and _can_be_done(q, dq, arm.ddq_max * dt_s, dt_s)):
         none = Unproven(np.empty((0, 2), np.int64), np.empty(0, np.int64))
         return False, course, planes, none, none
     course.ends[0] = ends_at(arm.chain, q[0])
