@@ -28,7 +28,6 @@ from hrcreplay.live.view import status
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.control_step import stop_straight
 from hrcreplay.robot.control.controllers import QpController
-from hrcreplay.robot.model import RobotModel
 from tests.facts import facts, tells
 from tests.live.counted import Cable, CountedLoop, counted
 from tests.live.crashing import BUG, failing
@@ -39,7 +38,7 @@ from tests.live.sessions import children
 PLACES: dict[str, tuple[Any, str]] = {
     "fusion": (Observer, "update_perception"),
     "controller": (QpController, "step"),
-    "every pose": (RobotModel, "pose"),
+    "every look": (control_step, "look"),
     "packets": (session_controller, "decode_robot"),
     "conversation": (EgmSession, "classify_all"),
     "reply": (EgmSession, "reply"),
