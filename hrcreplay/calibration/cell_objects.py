@@ -69,9 +69,9 @@ class CellObject(BaseModel):
     normal: Annotated[_Three, AfterValidator(_check_turn)] | None = None
     """half_space: the direction out of it."""
     file: Annotated[str, Field(min_length=1)] | None = None
-    """mesh: STL, OBJ, Collada or glTF; a relative path is searched beside the cell file."""
+    """mesh: STL, OBJ, Collada or glTF, with its axes as they are; a relative path is searched beside the cell file."""
     scale: _Size | None = None
-    """mesh: metres per unit of the file; 0.001 for millimetres."""
+    """mesh: metres per unit of the file; 0.001 for millimetres. None: what a Collada file says, otherwise 1."""
     if_concave: Literal["refuse", "hull", "decompose"] | None = None
     """mesh that is not convex: refuse it, take its convex hull, or decompose it with CoACD."""
     parts_m: (
@@ -167,7 +167,7 @@ def _with_hulls(one: CellObject, at: str, folder: Path | None) -> CellObject:
 
     if folder is None or one.file is None:
         raise SettingsError(f"{at}: file: a mesh can be named in a cell file only; would be right: shape hulls")
-    how = one.scale or 1.0, one.if_concave or "refuse", at
+    how = one.scale, one.if_concave or "refuse", at
     parts = read_parts(folder / one.file, *how, most_parts=MOST_PARTS, most_vertices=MOST_VERTICES)
     kept = {key: getattr(one, key) for key in ("name", "position_m", "rpy_deg", "frame", "may_approach")}
     points = [part.tolist() for part in parts]

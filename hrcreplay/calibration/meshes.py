@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -20,6 +22,9 @@ KINDS = (".stl", ".obj", ".dae", ".gltf", ".glb")
 MOST_BYTES = 20 << 20
 #: First bytes of packed files, which the library would unpack without a limit: zip, gzip, zstd.
 _PACKED = (b"PK", b"\x1f\x8b", b"\x28\xb5\x2f\xfd")
+#: The part of a Collada file in which its unit stands [bytes], and the unit.
+_HEAD_BYTES = 1 << 16
+_UNIT = re.compile(rb"<unit\b[^>]*?\bmeter\s*=\s*[\"']([^\"']*)[\"']")
 #: A mesh is convex if its volume is at least this share of its hull's.
 CONVEX = 0.99
 #: Largest concavity of the parts of a decomposition: that of CoACD, relative to the size of the mesh.
@@ -28,14 +33,30 @@ _CONCAVITY = 0.05
 _MISSED = 2e-3
 
 
+def unit_m(path: Path) -> float:
+    """Length of a unit of a mesh [m]: what a Collada file says, which libraries do not apply; otherwise 1.
+
+    Raises:
+        ValueError: The file gives no length.
+    """
+    if path.suffix.lower() != ".dae":
+        return 1.0
+    with path.open("rb") as file:
+        said = _UNIT.search(file.read(_HEAD_BYTES))
+    length = 1.0 if said is None else float(said[1])
+    if not (math.isfinite(length) and length > 0.0):
+        raise ValueError(f"its unit is {length} m")
+    return length
+
+
 def read_parts(
-    path: Path, scale: float, if_concave: str, at: str, *, most_parts: int, most_vertices: int
+    path: Path, scale: float | None, if_concave: str, at: str, *, most_parts: int, most_vertices: int
 ) -> list[Floats]:
     """Reads a mesh as convex parts, each of few points (m, 3) that enclose it [m].
 
     Args:
-        path: STL, OBJ, Collada or glTF.
-        scale: Metres per unit of the file.
+        path: STL, OBJ, Collada or glTF. The axes are those of the file.
+        scale: Metres per unit of the file; None: as the file says, see ``unit_m``.
         if_concave: ``refuse``, ``hull`` or ``decompose``.
         at: Prefix of error messages.
         most_parts: Largest number of parts.
@@ -44,7 +65,8 @@ def read_parts(
     Raises:
         SettingsError: The file cannot be read, or the mesh is not convex and that is refused.
     """
-    vertices, triangles = _read(path, at)
+    vertices, triangles, own_m = _read(path, at)
+    scale = own_m if scale is None else scale
     corners, faces = hull(vertices)
     if not len(faces):
         raise SettingsError(f"{at}: file: {path} is flat; would be right: a mesh with a volume")
@@ -64,8 +86,8 @@ def read_parts(
     return [_few(scale * hull(part)[0], most_vertices) for part in parts]
 
 
-def _read(path: Path, at: str) -> tuple[Floats, Ints]:
-    """Vertices (n, 3) in units of the file, and triangles (t, 3) of a mesh."""
+def _read(path: Path, at: str) -> tuple[Floats, Ints, float]:
+    """Vertices (n, 3) in units of the file, triangles (t, 3) of a mesh, and the unit [m]."""
     if path.suffix.lower() not in KINDS or not path.is_file():
         found = "is not a file" if not path.is_file() else "is of another format"
         raise SettingsError(f"{at}: file: {path} {found}; would be right: a mesh, {', '.join(KINDS)}")
@@ -80,11 +102,12 @@ def _read(path: Path, at: str) -> tuple[Floats, Ints]:
         mesh: Any = coal.MeshLoader().load(str(path), np.ones(3))
         triangles = np.array([[mesh.tri_indices(i)[k] for k in range(3)] for i in range(mesh.num_tris)], dtype=np.int64)
         vertices = np.array(mesh.vertices(), dtype=float).reshape(-1, 3)
+        own_m = unit_m(path)
     except (RuntimeError, ValueError) as error:
         raise SettingsError(f"{at}: file: {path} cannot be read as a mesh ({error})") from error
     if not len(vertices) or not np.isfinite(vertices).all():
         raise SettingsError(f"{at}: file: {path} holds no finite vertices; would be right: a mesh with a volume")
-    return vertices, triangles.reshape(-1, 3)
+    return vertices, triangles.reshape(-1, 3), own_m
 
 
 def _volume(vertices: Floats, triangles: Ints) -> float:

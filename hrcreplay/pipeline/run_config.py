@@ -121,13 +121,24 @@ _PACKED = (b"PK", b"\x1f\x8b", ZSTD_MAGIC)
 
 
 def _check_kind(mesh: Path) -> None:
-    """Rejects a mesh that may be packed, as the library unpacks it without a size limit."""
+    """Rejects a mesh that may be packed, as the library unpacks it without a size limit, or is not in metres."""
+    from hrcreplay.calibration.meshes import unit_m  # slow to load; few robots have meshes
+
     with mesh.open("rb") as file:
         packed = file.read(4).startswith(_PACKED)
     if packed or mesh.suffix.lower() not in _MESHES:
         raise SettingsError(
             f"robot.urdf: {mesh} is {'packed' if packed else 'of another format'}; STL, Collada and OBJ (.stl, .dae, "
             ".obj) are read, not packed, so convert it or give robot.links"
+        )
+    try:
+        length = unit_m(mesh)
+    except ValueError as error:
+        raise SettingsError(f"robot.urdf: {mesh}: {error}; a Collada mesh is in a unit > 0") from error
+    if length != 1.0:
+        raise SettingsError(
+            f"robot.urdf: {mesh} has a unit of {length:g} m; would be right: metres, because pinocchio converts no "
+            "unit, so convert it or give robot.links"
         )
 
 

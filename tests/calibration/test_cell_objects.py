@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import struct
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -19,6 +21,8 @@ from hrcreplay.calibration.meshes import read_parts
 from hrcreplay.errors import SettingsError
 from hrcreplay.records import Floats, Ints
 
+#: Position of the node in files that have nodes.
+SHIFT = np.array([3.0, -1.0, 2.0])
 MOST = {"most_parts": 64, "most_vertices": MOST_VERTICES}
 CELL = """
 [[objects]]
@@ -150,6 +154,60 @@ def obj(path: Path, vertices: Floats, triangles: Ints) -> Path:
     return path
 
 
+def gltf(path: Path, vertices: Floats, triangles: Ints) -> Path:
+    """One node, which moves the mesh back to where the vertices say; glTF has 32 bits a number."""
+    points, faces = (vertices - SHIFT).astype("<f4").tobytes(), triangles.astype("<u2").tobytes()
+    low, high = (vertices - SHIFT).min(axis=0).tolist(), (vertices - SHIFT).max(axis=0).tolist()
+    views = [
+        {"buffer": 0, "byteOffset": 0, "byteLength": len(points)},
+        {"buffer": 0, "byteOffset": len(points), "byteLength": len(faces)},
+    ]
+    document = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "translation": SHIFT.tolist()}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": len(vertices), "type": "VEC3", "min": low, "max": high},
+            {"bufferView": 1, "componentType": 5123, "count": triangles.size, "type": "SCALAR"},
+        ],
+        "bufferViews": views,
+    }
+    data = points + faces
+    if path.suffix == ".gltf":
+        uri = "data:application/octet-stream;base64," + base64.b64encode(data).decode()
+        path.write_text(json.dumps({**document, "buffers": [{"byteLength": len(data), "uri": uri}]}))
+        return path
+    text = json.dumps({**document, "buffers": [{"byteLength": len(data)}]}).encode()
+    text, data = text + b" " * (-len(text) % 4), data + b"\0" * (-len(data) % 4)
+    head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(data))
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(data), b"BIN\0") + data
+    path.write_bytes(head + chunks)
+    return path
+
+
+def dae(path: Path, vertices: Floats, triangles: Ints, unit: str = "1", up: str = "Z_UP") -> Path:
+    """One node, which moves the mesh back to where the vertices say."""
+    numbers, faces, way = (" ".join(map(str, array.ravel().tolist())) for array in (vertices - SHIFT, triangles, SHIFT))
+    axes = "".join(f'<param name="{axis}" type="float"/>' for axis in "XYZ")
+    path.write_text(
+        '<?xml version="1.0" encoding="utf-8"?>\n'
+        '<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">\n'
+        f'<asset><unit name="own" meter="{unit}"/><up_axis>{up}</up_axis></asset>\n'
+        '<library_geometries><geometry id="g"><mesh><source id="p">'
+        f'<float_array id="a" count="{vertices.size}">{numbers}</float_array><technique_common>'
+        f'<accessor source="#a" count="{len(vertices)}" stride="3">{axes}</accessor></technique_common></source>'
+        '<vertices id="v"><input semantic="POSITION" source="#p"/></vertices>'
+        f'<triangles count="{len(triangles)}"><input semantic="VERTEX" source="#v" offset="0"/><p>{faces}</p>'
+        "</triangles></mesh></geometry></library_geometries>\n"
+        f'<library_visual_scenes><visual_scene id="s"><node id="n"><translate>{way}</translate>'
+        '<instance_geometry url="#g"/></node></visual_scene></library_visual_scenes>\n'
+        '<scene><instance_visual_scene url="#s"/></scene></COLLADA>\n'
+    )
+    return path
+
+
 def turned_out(vertices: Floats, triangles: Ints) -> Ints:
     """Triangles of a convex mesh, counterclockwise from outside."""
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
@@ -171,13 +229,35 @@ def ell() -> tuple[Floats, Ints]:
     return vertices, np.vstack([top[:, ::-1], top + 6, sides])
 
 
-@pytest.mark.parametrize("write", [stl, obj])
-def test_a_convex_mesh_is_its_corners(tmp_path: Path, write: object) -> None:
+@pytest.mark.parametrize(
+    ("write", "ending"), [(stl, "stl"), (obj, "obj"), (gltf, "gltf"), (gltf, "glb"), (dae, "dae"), (dae, "DAE")]
+)
+def test_a_convex_mesh_is_its_corners(tmp_path: Path, write: Callable[..., Path], ending: str) -> None:
     corners = np.array([[x, y, z] for x in (0, 10) for y in (0, 20) for z in (0, 5)], dtype=float)
-    assert callable(write)
-    path = write(tmp_path / f"box.{getattr(write, '__name__', '')}", *solid(corners))
+    path = write(tmp_path / f"box.{ending}", *solid(corners))
     (part,) = read_parts(path, 0.001, "refuse", "cell", **MOST)
     assert sorted(part.tolist()) == sorted((0.001 * corners).tolist())
+
+
+@pytest.mark.parametrize(
+    ("said", "scale", "unit_m"), [("0.001", None, 0.001), ("1", None, 1.0), ("0.0254", 0.5, 0.5), ("1e-2", None, 0.01)]
+)
+def test_a_collada_mesh_is_in_its_own_unit_unless_a_scale_is_given(
+    tmp_path: Path, said: str, scale: float | None, unit_m: float
+) -> None:
+    corners = np.array([[x, y, z] for x in (0, 10) for y in (0, 20) for z in (0, 5)], dtype=float)
+    for up in ("Z_UP", "Y_UP"):  # the axes are those of the file
+        path = dae(tmp_path / f"{up}.dae", *solid(corners), unit=said, up=up)
+        (part,) = read_parts(path, scale, "refuse", "cell", **MOST)
+        assert sorted(part.tolist()) == sorted((unit_m * corners).tolist())
+
+
+def test_a_unit_that_is_no_length_is_refused(tmp_path: Path) -> None:
+    for said in ("0", "-1", "inf", "mm"):
+        path = dae(tmp_path / "a.dae", *ell(), unit=said)
+        with pytest.raises(SettingsError) as refused:
+            read_parts(path, None, "hull", "cell", **MOST)
+        assert "a.dae" in str(refused.value)
 
 
 def test_a_mesh_of_many_corners_is_enclosed_by_few(tmp_path: Path) -> None:

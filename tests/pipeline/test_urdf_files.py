@@ -49,6 +49,14 @@ def found(path: Path, *overrides: str) -> list[str]:
     return [file for _, file in files.meshes]
 
 
+@pytest.mark.parametrize("unit", ["0.01", "0"])
+def test_a_mesh_that_is_not_in_metres_is_refused(tmp_path: Path, unit: str) -> None:
+    """pinocchio takes the numbers as metres, so the links would be a hundred times as thick."""
+    (tmp_path / "arm.dae").write_text(f"<COLLADA><asset><unit name='own' meter='{unit}'/></asset></COLLADA>")
+    with pytest.raises(SettingsError, match=facts("arm.dae", "unit", unit)):
+        found(urdf(tmp_path / "robot.urdf", "arm.dae"))
+
+
 def test_packages_come_from_the_settings_then_beside_the_urdf_then_from_ros(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
