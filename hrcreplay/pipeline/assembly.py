@@ -221,29 +221,32 @@ class Surroundings:
         names, limbs = self.names, self.prediction.limbs
         return tuple(volume_name(i, names, limbs) for i in range(len(names) + (people - 1) * len(limbs)))
 
-    def obstacles(self, states: HumanStates, people: Sequence[Obstacles]) -> Obstacles:
+    def obstacles(self, states: HumanStates, rows: slice, people: Sequence[Obstacles]) -> Obstacles:
         """Returns the volumes of a tick and the border, as far as they are known.
 
         Args:
-            states: The fused people of a tick, one row each.
+            states: The fused people.
+            rows: Rows of the tick, one per person.
             people: Their volumes at that tick.
         """
-        fresh = states.frame_age_s <= self.fresh_s
+        fresh = states.frame_age_s[rows] <= self.fresh_s
+        numbers = [1] * len(fresh) if states.person is None else states.person[rows].tolist()
         if self.watched is None or states.nobody_s is None or states.nobody_else_s is None:
             found = join_obstacles(people)
-            return self._numbered(found if fresh.all() else replace(found, known=False), states.numbers)
-        since_s = float(np.where(fresh, states.nobody_else_s, states.nobody_s).max())
+            return self._numbered(found if all(fresh.tolist()) else replace(found, known=False), numbers)
+        since_s = float(np.where(fresh, states.nobody_else_s[rows], states.nobody_s[rows]).max())
         horizon_s = people[0].horizon_s
         depth_m = self.watched.depth_m(since_s, horizon_s)
         known = [one for one, there in zip(people, fresh.tolist(), strict=True) if there]
         person = join_obstacles(known) if known else len(self.prediction.limbs)
-        return self._numbered(self.watched.border.obstacles(depth_m, horizon_s, person), states.numbers[fresh])
+        there = [number for number, is_fresh in zip(numbers, fresh.tolist(), strict=True) if is_fresh]
+        return self._numbered(self.watched.border.obstacles(depth_m, horizon_s, person), there)
 
-    def _numbered(self, found: Obstacles, people: Ints) -> Obstacles:
-        """The volumes of people (k,) and what follows them, with their places in ``names_of`` if that is needed."""
-        if not (people != 1).any():
+    def _numbered(self, found: Obstacles, numbers: Sequence[int]) -> Obstacles:
+        """The volumes of people and what follows them, with their places in ``names_of`` if that is needed."""
+        if all(number == 1 for number in numbers):
             return found
-        each = len(self.prediction.limbs)
+        people, each = np.array(numbers), len(self.prediction.limbs)
         first = np.where(people == 1, 0, len(self.names) + (people - 2) * each)
         limbs = (first[:, None] + np.arange(each)).ravel()
         rest = each + np.arange(len(found.radius_m) - len(limbs))
@@ -282,7 +285,7 @@ class Forecast:
         else:
             volumes = self.person.volumes(horizon_s, rows.start, rows.stop)
             people = [obstacles(volumes, row, horizon_s) for row in range(len(volumes))]
-        return self.around.obstacles(self.states.rows(rows), people)
+        return self.around.obstacles(self.states, rows, people)
 
     def predict(self, tick: int) -> Predict:
         """Obstacles of one tick as a function of the horizon."""

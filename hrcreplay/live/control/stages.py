@@ -87,7 +87,7 @@ class Observer:
         people = look.people
         if not horizon_s:
             people = _each(self._surroundings.prediction.volumes(look.states, 0.0), 0.0)
-        found = self._surroundings.obstacles(look.states, people)
+        found = self._surroundings.obstacles(look.states, slice(None), people)
         return found if believed else replace(found, known=False)
 
     def _frames(self, t_ns: int, skeletons: Sequence[bytes]) -> CameraFrames | None:
