@@ -13,7 +13,6 @@ COPY --from=wheel /wheel /wheel
 RUN pip install --no-cache-dir --only-binary :all: -c /wheel/versions.txt /wheel/*.whl
 # The kernels are compiled once, for the processor of the build; another processor compiles its own at the first run.
 ENV NUMBA_CACHE_DIR=/kernels MPLCONFIGDIR=/tmp PYTHONDONTWRITEBYTECODE=1
-RUN mkdir /kernels /data && cd /tmp && python -c "import hrcreplay.commands.replay as r; print(r.demo_log())" > log \
-    && hrcreplay report "$(cat log)" --start 8 --end 11 --out first-run && rm -r first-run log && chmod -R a+rwX /kernels
+RUN mkdir /kernels /data && hrcreplay warmup && chmod -R a+rwX /kernels
 WORKDIR /data
 ENTRYPOINT ["hrcreplay"]

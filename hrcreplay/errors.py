@@ -51,5 +51,11 @@ class CoverageMissed(HrcReplayError):
     exit_code = 5
 
 
+class RunsFailed(HrcReplayError):
+    """Some runs of a sweep failed; the others are complete."""
+
+    exit_code = 7
+
+
 class SettingRenamed(FutureWarning):
     """A setting has a name from an earlier version."""

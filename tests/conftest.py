@@ -1,7 +1,4 @@
-"""Runs that several tests share, and how two processes share the tests (``make test`` runs them by pytest-xdist).
-
-Nothing of hrcreplay with compiled kernels is imported before ``pytest_configure`` has said where these are kept.
-"""
+"""Runs that several tests share, and how two processes share the tests (``make test`` runs them by pytest-xdist)."""
 
 from __future__ import annotations
 
@@ -11,8 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
-
-from hrcreplay import kernels
 
 if TYPE_CHECKING:
     from hrcreplay.store.run_folder import Run
@@ -58,24 +53,6 @@ def group_of(nodeid: str) -> str:
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Adds ``--quick``."""
     parser.addoption("--quick", action="store_true", help="only the quick tests, tests/conftest.py QUICK")
-
-
-def pytest_configure(config: pytest.Config) -> None:
-    """Gives every process but the first compiled kernels of its own, as numba does not lock its files."""
-    worker = os.environ.get("PYTEST_XDIST_WORKER", "gw0")
-    if worker != "gw0":
-        os.environ["NUMBA_CACHE_DIR"] = str(kernels.folder() / worker)
-        kernels.folder.cache_clear()
-
-
-@pytest.hookimpl(optionalhook=True)
-def pytest_xdist_setupnodes(config: pytest.Config, specs: list[Any]) -> None:
-    """Gives every process what any of them has compiled before, as they do not run the same tests each time."""
-    first, others = kernels.folder(), [kernels.folder() / spec.id for spec in specs[1:]]
-    for folder in others:
-        kernels.share(folder, first)
-    for folder in others:
-        kernels.share(first, folder)
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import shutil
 import subprocess
@@ -60,3 +61,43 @@ def test_importing_the_package_changes_nothing_of_the_process() -> None:
     code += "from hrcreplay.geometry import vectors\nimport numba\nassert numba.config.CACHE_DIR == ''\n"
     clean = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
     subprocess.run([sys.executable, "-c", code], check=True, env=clean)
+
+
+def _is_kernel(node: ast.AST, word: str = "njit") -> bool:
+    return isinstance(node, ast.FunctionDef) and any(word in ast.unparse(one) for one in node.decorator_list)
+
+
+def _calls_from_python(path: Path, module: str) -> set[str]:
+    """Dotted names of functions that the Python code of a file names: its own, imported ones, those of modules."""
+    tree = ast.parse(path.read_text())
+    known = {node.name: f"{module}.{node.name}" for node in tree.body if isinstance(node, ast.FunctionDef)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom):
+            known |= {alias.asname or alias.name: f"{node.module}.{alias.name}" for alias in node.names}
+    found: set[str] = set()
+
+    def visit(node: ast.AST) -> None:
+        if _is_kernel(node):
+            return
+        if isinstance(node, ast.Name) and node.id in known:
+            found.add(known[node.id])
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in known:
+            found.add(f"{known[node.value.id]}.{node.attr}")
+        for child in ast.iter_child_nodes(node):
+            visit(child)
+
+    visit(tree)
+    return found
+
+
+def test_inner_kernels_are_called_by_kernels_alone() -> None:
+    """A call from Python would crash the process: an inner kernel has no entry for it."""
+    root = Path(hrcreplay.__file__).parents[1]
+    inner, called = set(), set()
+    for path in [*root.joinpath("hrcreplay").rglob("*.py"), *root.joinpath("tests").rglob("*.py")]:
+        module = ".".join(path.relative_to(root).with_suffix("").parts)
+        functions = [one for one in ast.parse(path.read_text()).body if isinstance(one, ast.FunctionDef)]
+        inner |= {f"{module}.{one.name}" for one in functions if _is_kernel(one, "inner=True")}
+        called |= _calls_from_python(path, module)
+    assert len(inner) > 20
+    assert not inner & called

@@ -27,8 +27,10 @@ from hrcreplay.limits import load_limits, write_limits
 from hrcreplay.logs.reader import open_log
 from hrcreplay.pipeline import assembly
 from hrcreplay.pipeline.assembly import PredictionStage
+from hrcreplay.pipeline.kernel_build import ensure_compiled
+from hrcreplay.pipeline.progress import ProgressBar
 from hrcreplay.pipeline.run_config import RunConfig, RunOptions, resolve
-from hrcreplay.pipeline.stages import NS, ProgressBar, span_ns, tick_times
+from hrcreplay.pipeline.stages import NS, span_ns, tick_times
 from hrcreplay.records import JOINTS, LIMBS, Floats
 from hrcreplay.reporting.tables import share_text
 from hrcreplay.version import __version__
@@ -160,6 +162,7 @@ def run(
         LogError: A log cannot be read, is too short, or shows no arm motion.
     """
     _refuse(logs, out, coverage, held_back, cover)
+    ensure_compiled()
     run_configs = [resolve("fit-limits", log, **options) for log in logs]
     horizon_s = _horizon_s(run_configs)
     samples = [_sample(run_config, horizon_s, held_back, cover == "limbs") for run_config in run_configs]

@@ -48,6 +48,12 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "why": ("hrcreplay why reports/session/RUN --at 46", "hrcreplay why reports/session/RUN --at 46 --method scaling"),
     "audit": ("hrcreplay audit session.mcap --cell cell.toml",),
     "fit-limits": ("hrcreplay fit-limits monday.mcap tuesday.mcap --out ours.toml",),
+    "warmup": ("hrcreplay warmup",),
+    "bench": ("hrcreplay bench", "hrcreplay bench session.mcap --cell cell.toml --json > bench.json"),
+    "sweep": (
+        "hrcreplay sweep monday.mcap tuesday.mcap --grid plan.method=qp,scaling --grid plan.clearance_m=0,0.05",
+        "hrcreplay sweep s3://logs/monday.mcap --base 1.2,0,0,180 --base 1.5,0,0,180 --scheduler tcp://host:8786",
+    ),
     "init": ("hrcreplay init new",),
     "settings": ("hrcreplay settings", "hrcreplay settings plan > settings.toml"),
     "demo": ("hrcreplay demo --out demo",),

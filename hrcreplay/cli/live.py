@@ -65,6 +65,7 @@ def live(
     Exit code 4 when a stop reason ended the motion. A research tool, not a certified safety function.
     """
     from hrcreplay.live import session
+    from hrcreplay.pipeline.kernel_build import ensure_compiled
 
     request = session.Request(
         human=human,
@@ -79,6 +80,7 @@ def live(
         overrides=as_overrides(settings, None, limits),
         cell=cell,
     )
+    ensure_compiled()  # before the robot waits
     sys.stdout.write(f"{session.run(request)}\n")
 
 

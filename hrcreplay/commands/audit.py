@@ -46,8 +46,9 @@ from hrcreplay.human.prediction import swept_volumes
 from hrcreplay.human.prediction.swept_volumes import limb_radii
 from hrcreplay.pipeline import assembly
 from hrcreplay.pipeline.assembly import PredictionStage
+from hrcreplay.pipeline.kernel_build import ensure_compiled
+from hrcreplay.pipeline.progress import print_note
 from hrcreplay.pipeline.run_config import RunConfig, RunOptions, resolve
-from hrcreplay.pipeline.stages import print_note
 from hrcreplay.reporting.tables import percent
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import RunWriter, Stopwatch
@@ -87,6 +88,7 @@ def run(sources: Sequence[Path], *, out: Path | None = None, **options: Unpack[R
     began = datetime.now(UTC)
     run_configs = [resolve("audit", source, **options) for source in sources]
     _check_alike(run_configs)
+    ensure_compiled()
     with RunWriter(out or Path("reports") / run_configs[0].log.stem / f"{began:%Y%m%dT%H%M%SZ}-audit") as writer:
         watch = Stopwatch(time.perf_counter_ns)
         audits = [

@@ -8,7 +8,6 @@ an earlier run with the same settings is reused; its metrics are computed again.
 from __future__ import annotations
 
 import multiprocessing
-import os
 import shutil
 import signal
 import time
@@ -23,7 +22,6 @@ from typing import Any, Unpack, get_args
 import pandas as pd
 import pyarrow.parquet as pq
 
-from hrcreplay import kernels
 from hrcreplay.commands import replay
 from hrcreplay.commands.notes import notes_of
 from hrcreplay.errors import SettingsError
@@ -40,9 +38,11 @@ from hrcreplay.evaluation.severity import severity_table
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.pipeline import assembly, reuse, stages
 from hrcreplay.pipeline.assembly import Follower, Forecast, Recorded
+from hrcreplay.pipeline.kernel_build import ensure_compiled
+from hrcreplay.pipeline.progress import ProgressBar, print_note
 from hrcreplay.pipeline.robot_mass import robot_mass
 from hrcreplay.pipeline.run_config import RunConfig, RunOptions, resolve
-from hrcreplay.pipeline.stages import ProgressBar, Sink, collect_plan_findings, print_note
+from hrcreplay.pipeline.stages import Sink, collect_plan_findings
 from hrcreplay.records import RECORDED, UNGUARDED, Floats, Ints
 from hrcreplay.reporting import comparison
 from hrcreplay.reporting.comparison import Variant
@@ -128,6 +128,7 @@ def run(
             "prediction.method, plan.horizon: the runs given differ, and one table has one of each; name them in "
             "--methods, as qp:sound:adaptive"
         )
+    ensure_compiled()
     with RunWriter(out or replay.REPORTS / run_configs[0].log.stem / f"{began:%Y%m%dT%H%M%SZ}-compare") as writer:
         watch = Stopwatch(time.perf_counter_ns)
         logs = [
@@ -403,23 +404,9 @@ def _plan_all(tasks: Sequence[VariantTask], processes: int, advance: Callable[[i
 
 
 def _second_process() -> ProcessPoolExecutor:
-    """Starts a process with its own copy of the compiled kernels, as numba does not lock its files.
-
-    It ignores Ctrl-C: the first process ends it.
-    """
-    second = kernels.folder() / "second"
-    kernels.share(kernels.folder(), second)
+    """Starts a process that ignores Ctrl-C: the first process ends it."""
     spawn = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(1, spawn, initializer=signal.signal, initargs=(signal.SIGINT, signal.SIG_IGN))
-    mine = os.environ.get("NUMBA_CACHE_DIR")
-    os.environ["NUMBA_CACHE_DIR"] = str(second)  # read by the process at its start
-    try:
-        pool.submit(os.getpid).result()
-    finally:
-        os.environ.pop("NUMBA_CACHE_DIR")
-        if mine is not None:
-            os.environ["NUMBA_CACHE_DIR"] = mine
-    return pool
+    return ProcessPoolExecutor(1, spawn, initializer=signal.signal, initargs=(signal.SIGINT, signal.SIG_IGN))
 
 
 def plan(task: VariantTask, progress: Callable[[int], None] | None = None) -> tuple[int, float]:

@@ -149,8 +149,8 @@ def calibrate(
     if out.exists():
         raise SettingsError(f"{out}: exists already; name another file, or remove it")
     settings = load_settings(config, overrides)
-    axis = None if up is None else _numbers("--up", up, 3)
-    place = None if base is None else _numbers("--base", base, 4)
+    axis = None if up is None else parse_numbers("--up", up, 3)
+    place = None if base is None else parse_numbers("--base", base, 4)
     if height_m is not None and not 0.0 <= height_m < math.inf:
         raise SettingsError(f"--height {height_m:g}: would be right: metres above the floor, 0 or more, e.g. 1.6")
     opened = open_log(log, settings.logs)
@@ -172,7 +172,12 @@ def calibrate(
     return [*lines, *stood, *opened.notes, *cell.notes]
 
 
-def _numbers(option: str, text: str, count: int) -> list[float]:
+def parse_numbers(option: str, text: str, count: int) -> list[float]:
+    """Parses an option that takes finite numbers with commas between.
+
+    Raises:
+        SettingsError: It has another form.
+    """
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:

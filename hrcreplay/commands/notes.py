@@ -75,13 +75,13 @@ def initial_overlap(state: Path, motion: Path, rate_hz: float) -> str | None:
     people = pq.read_table(state, columns=["t_ns", "x"]).to_pandas()
     person = people.groupby("t_ns", sort=True)["x"].first().to_numpy()  # the first known one of each tick
     table = pq.read_table(motion, columns=["distance_m", "link", "limb"])
-    distance_m, links, limbs = (table[name].to_pylist() for name in ("distance_m", "link", "limb"))
-    near = [i for i in np.flatnonzero(np.isfinite(person)).tolist() if limbs[i] is not None]
+    near = np.flatnonzero(np.isfinite(person) & table["limb"].is_valid().to_numpy())
     near = near[: max(1, round(_FIRST_S * rate_hz))]
-    if not near or not all(distance_m[i] <= 0.0 for i in near):
+    if not len(near) or not (table["distance_m"].to_numpy()[near] <= 0.0).all():
         return None
+    link, limb = (table[name][int(near[0])].as_py() for name in ("link", "limb"))
     return (
-        f"the robot's link {links[near[0]]} stands inside the volume of the person's {limbs[near[0]]} from the first "
+        f"the robot's link {link} stands inside the volume of the person's {limb} from the first "
         f"tick with a person on, for {len(near) / rate_hz:.2f} s at least; is T_world_base right? "
         "hrcreplay calibrate prints the person's position"
     )

@@ -19,16 +19,11 @@ import pyarrow.parquet as pq
 from hrcreplay.commands.notes import notes_of
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.pipeline import assembly, reuse, stages
+from hrcreplay.pipeline.kernel_build import ensure_compiled
+from hrcreplay.pipeline.progress import NO_PROGRESS, Progress, ProgressBar, print_note
 from hrcreplay.pipeline.robot_mass import robot_mass
 from hrcreplay.pipeline.run_config import RunConfig, RunOptions, resolve
-from hrcreplay.pipeline.stages import (
-    ProgressBar,
-    Sink,
-    Told,
-    collect_fusion_findings,
-    collect_plan_findings,
-    print_note,
-)
+from hrcreplay.pipeline.stages import Sink, Told, collect_fusion_findings, collect_plan_findings
 from hrcreplay.records import HumanStates, Ints
 from hrcreplay.reporting import tables
 from hrcreplay.reporting.summary_text import defect_notes
@@ -67,27 +62,42 @@ def run(
     """
     began = datetime.now(UTC)
     run_config = resolve(command, source, **options)
-    known = run_config.meta()
-    with RunWriter(out or _folder(run_config, began)) as writer:
+    return execute(run_config, out or _folder(run_config, began), smooth=smooth, chunk_ticks=chunk_ticks)
+
+
+def execute(run_config: RunConfig, folder: Path, *, smooth: bool = False, chunk_ticks: int = 250) -> Path:
+    """Runs the stages of a resolved run and writes its folder.
+
+    Args:
+        run_config: The run.
+        folder: Run folder to make.
+        smooth: True: also write the smoothed person (smooth.parquet).
+        chunk_ticks: Ticks of a batch; changes no result.
+
+    Returns:
+        The run folder.
+
+    Raises:
+        SettingsError: The cell, the task or the output folder cannot be used.
+        LogError: The log cannot be read, or lacks what a stage needs.
+    """
+    began, known = datetime.now(UTC), run_config.meta()
+    ensure_compiled()
+    with RunWriter(folder) as writer, ProgressBar(f"reading {run_config.log.name}") as bar:
         log = open_log(run_config.log, run_config.settings.logs)
         ticks_ns = stages.span_ticks(run_config, log)
         parts = reuse.dependencies(run_config, log, ticks_ns)
         reused = reuse.take_over(run_config, parts, writer, smooth=smooth)
-        last = [stage for stage in run_config.stages if stage not in reused][-1:]
-        with ProgressBar(last[0] if last else "", len(ticks_ns)) as bar:
-            sink = Sink(writer, Stopwatch(time.perf_counter_ns), bar.advance)
-            compared = command == "report" and not log.header.has_truth  # this then includes the smoothed person
-            told = run_stages(
-                run_config, log, ticks_ns, chunk_ticks, sink, reused, folder=writer.partial, smooth=smooth or compared
-            )
-        found = findings(run_config, told, reused)
-        complete(
-            run_config,
-            log,
-            writer,
-            sink.watch,
-            {**known, **found, **describe_run(run_config, began, parts, smooth=smooth)},
+        for stage in [stage for stage in run_config.stages if stage not in reused][-1:]:
+            bar.begin(stage, len(ticks_ns))
+        sink = Sink(writer, Stopwatch(time.perf_counter_ns), bar.advance)
+        compared = run_config.command == "report" and not log.header.has_truth  # this then includes the smoothed person
+        told = run_stages(
+            run_config, log, ticks_ns, chunk_ticks, sink, reused, folder=writer.partial, smooth=smooth or compared
         )
+        found = findings(run_config, told, reused)
+        meta = {**known, **found, **describe_run(run_config, began, parts, smooth=smooth)}
+        complete(run_config, log, writer, sink.watch, meta, bar)
         return writer.folder
 
 
@@ -108,7 +118,14 @@ def describe_run(run_config: RunConfig, began: datetime, parts: Mapping[str, str
     }
 
 
-def complete(run_config: RunConfig, log: Log, writer: RunWriter, watch: Stopwatch, meta: dict[str, Any]) -> None:
+def complete(
+    run_config: RunConfig,
+    log: Log,
+    writer: RunWriter,
+    watch: Stopwatch,
+    meta: dict[str, Any],
+    progress: Progress = NO_PROGRESS,
+) -> None:
     """Completes a run whose stages have written their tables; also makes the report if requested.
 
     Args:
@@ -117,6 +134,7 @@ def complete(run_config: RunConfig, log: Log, writer: RunWriter, watch: Stopwatc
         writer: Run folder.
         watch: Times of the stages; the times of the report are added.
         meta: Entries of run.json so far.
+        progress: Receives the progress.
     """
     base = assembly.known_robot_base(run_config, log)
     if log.header.joint_topics or meta["counts"].get("joint_gaps_ms"):
@@ -127,12 +145,14 @@ def complete(run_config: RunConfig, log: Log, writer: RunWriter, watch: Stopwatc
         print_note(line)
     meta["T_world_base"] = None if base is None else base.tolist()
     if run_config.command == "report":
-        _report(run_config, log, writer, watch, meta)
+        _report(run_config, log, writer, watch, meta, progress)
     writer.timing.update(watch.summary(1.0 / run_config.settings.fusion.rate_hz))
     writer.finish(meta)
 
 
-def _report(run_config: RunConfig, log: Log, writer: RunWriter, watch: Stopwatch, meta: dict[str, Any]) -> None:
+def _report(
+    run_config: RunConfig, log: Log, writer: RunWriter, watch: Stopwatch, meta: dict[str, Any], progress: Progress
+) -> None:
     """Writes the contact table and the report of a run whose other tables are written."""
     from hrcreplay.commands.report import write_report
     from hrcreplay.evaluation.contact import (
@@ -140,10 +160,11 @@ def _report(run_config: RunConfig, log: Log, writer: RunWriter, watch: Stopwatch
     )
 
     ticks = pq.read_metadata(writer.partial / "state.parquet").num_rows
+    progress.begin("contact")
     with watch.stage("contact", ticks):
         write_contact(run_config, log, writer, assembly.robot_base(run_config, log))
     with watch.stage("report", ticks):
-        write_report(run_config, writer, meta, log)
+        write_report(run_config, writer, meta, log, progress)
 
 
 def run_stages(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePath
 from typing import Any
@@ -14,6 +14,7 @@ from hrcreplay.errors import SettingsError
 from hrcreplay.human.model import PARTS, part_radii
 from hrcreplay.logs.reader import Log
 from hrcreplay.pipeline import assembly
+from hrcreplay.pipeline.progress import NO_PROGRESS, Progress
 from hrcreplay.pipeline.run_config import RunConfig, read_run_config
 from hrcreplay.records import Floats
 from hrcreplay.reporting import tables
@@ -43,7 +44,13 @@ from hrcreplay.store.run_folder import Run, RunWriter
 ALL_FIGURES = "all"
 
 
-def write_report(run_config: RunConfig, writer: RunWriter, meta: dict[str, Any], log: Log | None = None) -> None:
+def write_report(
+    run_config: RunConfig,
+    writer: RunWriter,
+    meta: dict[str, Any],
+    log: Log | None = None,
+    progress: Progress = NO_PROGRESS,
+) -> None:
     """Writes metrics.json, the figures, report.html, scene.mcap and its layout beside the tables just written.
 
     Args:
@@ -51,7 +58,9 @@ def write_report(run_config: RunConfig, writer: RunWriter, meta: dict[str, Any],
         writer: Run folder.
         meta: Content of run.json.
         log: Log of a replay, whose ticks can be computed again; None for a live session.
+        progress: Receives the progress.
     """
+    progress.begin("metrics")
     near = _bounds(run_config.settings.model_dump())
     meta["cameras"] = {name: T.tolist() for name, T in sorted(_camera_poses(run_config, log).items())}
     everybody = run_folder.read(writer.partial, meta, shown=True)
@@ -66,7 +75,10 @@ def write_report(run_config: RunConfig, writer: RunWriter, meta: dict[str, Any],
     if prediction_stage.method == "sound" and prediction.legs:
         radii["legs, of sound"] = prediction.legs_radius_m
     folder = writer.partial / "figures"
-    _draw_figures(run_config, everybody, found, catalogue.select_figures(run, found), folder)
+    kinds = catalogue.select_figures(run, found)
+    progress.begin("figures", len(kinds))
+    _draw_figures(run_config, everybody, found, kinds, folder, drawn_one=lambda: progress.advance("figures"))
+    progress.begin("page")
     shown = [
         tables.limit_table(run_config.prediction_limits, use="prediction"),
         tables.limit_table(run_config.tracking_limits, use="tracking"),
@@ -98,6 +110,7 @@ def _draw_figures(
     folder: Path,
     *,
     pdf: bool = False,
+    drawn_one: Callable[[], None] = lambda: None,
 ) -> list[str]:
     """Draws figures of a run with all its people; those of one person for each, where they are made for that.
 
@@ -108,6 +121,7 @@ def _draw_figures(
         kinds: The figures.
         folder: Folder for the files.
         pdf: True: also as PDF.
+        drawn_one: Called after each figure.
 
     Returns:
         The names drawn.
@@ -116,7 +130,7 @@ def _draw_figures(
     for number in everybody.people:
         chosen = [kind for kind in kinds if number == everybody.people[0] or kind.each]
         data = figure_data(run_config, everybody, metrics, chosen, number)
-        drawn += catalogue.draw_all(data, folder, chosen, number, pdf=pdf)
+        drawn += catalogue.draw_all(data, folder, chosen, number, pdf=pdf, drawn=drawn_one)
     return drawn
 
 

@@ -11,8 +11,8 @@ from typing import Any
 
 from hrcreplay.pipeline import assembly
 from hrcreplay.pipeline.assembly import LogLike
+from hrcreplay.pipeline.progress import print_note
 from hrcreplay.pipeline.run_config import TABLES, RunConfig, urdf_digest, versions
-from hrcreplay.pipeline.stages import print_note
 from hrcreplay.records import Ints
 from hrcreplay.settings.sections import Logs
 from hrcreplay.store import run_folder
@@ -85,6 +85,24 @@ def dependencies(run_config: RunConfig, log: LogLike, ticks_ns: Ints) -> dict[st
             "settings plan": _without(settings["plan"], "task"),
         }
     return {name: _digest(part) for name, part in found.items()}
+
+
+def person_digest(run_config: RunConfig) -> str:
+    """Computes a digest over all that the fused person depends on, except the log: the same for settings that share it.
+
+    The digests of ``stage_digests`` decide whether a stage is reused; this one only groups runs before logs are read.
+    """
+    settings = run_config.settings.model_dump(mode="json")
+    cell = None if run_config.cell is None else run_config.cell.to_dict()
+    return _digest(
+        [
+            _without(settings["logs"], *_JOINT_SETTINGS),
+            settings["fusion"],
+            _without(run_config.tracking_limits.plain(), "name"),
+            None if cell is None else {name: cell.get(name) for name in ("cameras", "watched")},
+            [run_config.start_s, run_config.end_s],
+        ]
+    )
 
 
 def _programme(run_config: RunConfig, log: LogLike, joint_settings: dict[str, Any]) -> Any:

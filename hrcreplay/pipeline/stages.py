@@ -1,21 +1,14 @@
-"""The three stages as generators over batches of ticks, and the progress bar of a run.
-
-Each stage passes its rows on to the next and writes its tables. The progress bar shows on a terminal only.
-"""
+"""The three stages as generators over batches of ticks. Each passes its rows on to the next and writes its tables."""
 
 from __future__ import annotations
 
 import math
-import sys
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from types import TracebackType
-from typing import Any, NamedTuple, Protocol, Self
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from hrcreplay.calibration.clock_check import ClockCheck
 from hrcreplay.errors import LogError, SettingsError
@@ -268,6 +261,44 @@ def write_checks(checks: CameraChecks, sink: Sink) -> None:
             sink.tables.table(name, record_columns(rows))
 
 
+class PersonExtent(NamedTuple):
+    """Where and when the measurements of a person are."""
+
+    frames: int
+    first_ns: int  #: of the captures
+    last_ns: int
+    cameras: frozenset[int]
+    low_m: Floats  #: (3,) least coordinates of the middle of its points, world [m]
+    high_m: Floats  #: (3,) greatest ones [m]
+
+    @classmethod
+    def of(cls, seen: Measurements) -> PersonExtent:
+        """Finds the extent of some measurements."""
+        known = np.isfinite(seen.points_m).sum(axis=1)
+        middle_m = np.nansum(seen.points_m, axis=1) / np.where(known > 0, known, np.nan)  # nanmean would warn
+        return cls(
+            frames=len(seen),
+            first_ns=int(seen.capture_ns.min()),
+            last_ns=int(seen.capture_ns.max()),
+            cameras=frozenset(seen.camera.tolist()),
+            low_m=np.fmin.reduce(middle_m),
+            high_m=np.fmax.reduce(middle_m),
+        )
+
+    def join(self, other: PersonExtent | None) -> PersonExtent:
+        """Returns the extent of both."""
+        if other is None:
+            return self
+        return PersonExtent(
+            self.frames + other.frames,
+            min(self.first_ns, other.first_ns),
+            max(self.last_ns, other.last_ns),
+            self.cameras | other.cameras,
+            np.fmin(self.low_m, other.low_m),
+            np.fmax(self.high_m, other.high_m),
+        )
+
+
 class PeopleChecks:
     """The checks of the cameras by each person; those by the person shown most are written.
 
@@ -280,7 +311,7 @@ class PeopleChecks:
     def __init__(self, cameras: tuple[str, ...]) -> None:
         self._cameras = cameras
         self._checks: dict[int, CameraChecks] = {}
-        self._parts: dict[int, list[Measurements]] = defaultdict(list)
+        self._extents: dict[int, PersonExtent] = {}
 
     def add(self, measured: Measurements) -> None:
         """Adds the measurements of some frames."""
@@ -288,23 +319,22 @@ class PeopleChecks:
             mine = measured.rows(measured.numbers == number)
             checks = self._checks.setdefault(number, CameraChecks(self._cameras))
             checks.add(mine.camera, SkeletonTrack(mine.capture_ns, mine.points_m, mine.confidence))
-            self._parts[number].append(replace(mine, person=None))
+            self._extents[number] = PersonExtent.of(mine).join(self._extents.get(number))
 
     def write(self, sink: Sink) -> None:
         """Writes the checks and notes."""
-        frames = {number: sum(map(len, parts)) for number, parts in self._parts.items()}
-        most = max(frames, key=lambda number: frames[number], default=None)
+        most = max(self._extents, key=lambda number: self._extents[number].frames, default=None)
         write_checks(CameraChecks(self._cameras) if most is None else self._checks[most], sink)
         sink.notes["fuse"].extend(self.describe())
 
     def describe(self) -> Iterator[str]:
         """Returns the note on several people, and one for each that may be a thing; none for one person."""
-        people = {number: Measurements.join(parts) for number, parts in self._parts.items()}
+        people = self._extents
         if len(people) < 2:
             return
-        start_ns = min(int(seen.capture_ns.min()) for seen in people.values())
+        start_ns = min(seen.first_ns for seen in people.values())
         spans = {
-            number: ((int(seen.capture_ns.min()) - start_ns) / NS, (int(seen.capture_ns.max()) - start_ns) / NS)
+            number: ((seen.first_ns - start_ns) / NS, (seen.last_ns - start_ns) / NS)
             for number, seen in sorted(people.items())
         }
         each = ", ".join(f"person {number} from {a:.1f} to {b:.1f} s" for number, (a, b) in spans.items())
@@ -312,13 +342,13 @@ class PeopleChecks:
             f"{len(people)} bodies were tracked, and the robot keeps clear of all of them: {each} after the first frame"
         )
         for number, (a, b) in spans.items():
-            shown_by, middle_m = np.unique(people[number].camera), np.nanmean(people[number].points_m, axis=1)
-            if len(shown_by) == 1 < len(self._cameras) and b - a >= self.STILL_S:
-                within_m = float(np.nanmax(np.nanmax(middle_m, axis=0) - np.nanmin(middle_m, axis=0)))
+            seen = people[number]
+            if len(seen.cameras) == 1 < len(self._cameras) and b - a >= self.STILL_S:
+                within_m = float(np.nanmax(seen.high_m - seen.low_m))
                 if within_m <= self.STILL_M:
                     yield (
-                        f"person {number} may be no person: {self._cameras[shown_by[0]]} alone shows this body, which "
-                        f"stays within {within_m:.2f} m for {b - a:.1f} s; the robot keeps clear of it; would be "
+                        f"person {number} may be no person: {self._cameras[min(seen.cameras)]} alone shows this body, "
+                        f"which stays within {within_m:.2f} m for {b - a:.1f} s; the robot keeps clear of it; would be "
                         "right, if it is a thing: what hides it from the camera's tracker, or logs.people = nearest"
                     )
 
@@ -562,33 +592,3 @@ def nearest_columns(robot: RobotModel, static: StaticObstacles | None, motion: M
         self_m=found.links_m,
         self_links=(found.links[:, 0], found.links[:, 1], motion.links),
     )
-
-
-def print_note(text: str) -> None:
-    """Prints a line for the user on standard error, separate from the result on standard output."""
-    sys.stderr.write(f"hrcreplay: {text}\n")
-
-
-class ProgressBar:
-    """A progress bar over the ticks of a run's last stage; shown on a terminal only."""
-
-    def __init__(self, stage: str, ticks: int) -> None:
-        self._stage = stage
-        console = Console(stderr=True)
-        columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:.0f} %"))
-        self._bar = Progress(*columns, TimeRemainingColumn(), console=console, disable=not console.is_terminal)
-        self._task: TaskID = self._bar.add_task(stage, total=ticks)
-
-    def __enter__(self) -> Self:
-        self._bar.start()
-        return self
-
-    def advance(self, stage: str, ticks: int) -> None:
-        """Adds the ticks that a stage has finished."""
-        if stage == self._stage:
-            self._bar.advance(self._task, ticks)
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._bar.stop()

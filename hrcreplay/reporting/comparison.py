@@ -207,19 +207,24 @@ _OF_CONTROLLERS = (
 
 
 def figures(
-    variant: Variant, motion: pd.DataFrame, contact: pd.DataFrame, meetings: pd.DataFrame, bounds: Bounds
+    variant: Variant,
+    motion: pd.DataFrame,
+    contact: pd.DataFrame | None,
+    meetings: pd.DataFrame | None,
+    bounds: Bounds,
 ) -> dict[str, Any]:
     """Computes the figures of a variant on one log: FIELDS, MORE; None if inapplicable.
 
     Args:
         variant: The variant.
         motion: Its table of motion.
-        contact: Its rows of contact.
-        meetings: Its rows of severity.
+        contact: Its rows of contact; None: not computed.
+        meetings: Its rows of severity; None: not computed.
         bounds: Bounds from the settings.
     """
     metrics = _metrics(variant, motion, contact, bounds)
-    found = {name: metrics[key]["value"] for name, key in _METRICS.items()}
+    known = {name: key for name, key in _METRICS.items() if contact is not None or key in metrics}
+    found = dict.fromkeys(_METRICS) | {name: metrics[key]["value"] for name, key in known.items()}
     given_s, lost_s = float(times(motion)[-1] - times(motion)[0]) * 1e-9, metrics["plan_time_lost_s"]["value"]
     found["given_s"], found["made_s"] = (None, None) if lost_s is None else (given_s, given_s - lost_s)
     found["retreating_ticks"] = int((motion["status"].astype(str) == "retreating").sum())
@@ -233,15 +238,16 @@ def figures(
     found["jerk_rms_rad_per_s3"] = float(np.sqrt(np.mean(jerk**2))) if jerk.size else None
     found["jerk_max_rad_per_s3"] = float(np.abs(jerk).max()) if jerk.size else None
     for prefix, until in (("", "volumes"), ("full_", "volumes_full")):
-        left, checked = metrics[f"{until}_left_ticks"]["value"], found[f"{prefix}checked_ticks"]
+        checked = found[f"{prefix}checked_ticks"]
+        left = None if checked is None else metrics[f"{until}_left_ticks"]["value"]
         found[f"{prefix}held_ticks"] = None if checked is None else checked - left
     if variant.method == RECORDED:
         found |= dict.fromkeys(_OF_CONTROLLERS)
-    met = severity.summary(meetings)
+    met = dict.fromkeys(severity.FIGURES) if meetings is None else severity.summary(meetings)
     return _add_ratios(found | met) | {"braking_events_by_cause": causes, "worst_contact": met["worst"]}
 
 
-def _metrics(variant: Variant, motion: pd.DataFrame, contact: pd.DataFrame, bounds: Bounds) -> dict[str, Metric]:
+def _metrics(variant: Variant, motion: pd.DataFrame, contact: pd.DataFrame | None, bounds: Bounds) -> dict[str, Metric]:
     """Computes the metrics of this motion as in a report, without other methods."""
     table = MetricTable()
     settings = {"plan": {"method": variant.method}}

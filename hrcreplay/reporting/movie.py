@@ -14,7 +14,7 @@ from hrcreplay.errors import SettingsError
 from hrcreplay.records import FLOOR_Z_M, Floats
 from hrcreplay.reporting.figures.scene import RenderedHull, View, bounds_of, render_hulls, view_from
 from hrcreplay.reporting.page.replay_page import ELEVATION_RAD, clearest_azimuth, reach, solids
-from hrcreplay.reporting.replay_scene import RATE_HZ, ReplayScene
+from hrcreplay.reporting.replay_scene import ReplayScene
 from hrcreplay.reporting.tour import TourStop, tour
 
 #: Size of the scene of one method [pixels], and of the lines of text above and below.
@@ -47,10 +47,10 @@ def write_movie(path: Path, scene: ReplayScene) -> None:
     every = _EVERY[path.suffix]
     pictures = frames(scene, stops, every)
     if path.suffix == ".mp4":
-        _write_mp4(path, pictures, RATE_HZ / every)
+        _write_mp4(path, pictures, scene.rate_hz / every)
         return
     first, *others = [one.quantize(96, dither=Image.Dither.NONE) for one in pictures]
-    first.save(path, save_all=True, append_images=others, duration=round(1000.0 * every / RATE_HZ), loop=0)
+    first.save(path, save_all=True, append_images=others, duration=round(1000.0 * every / scene.rate_hz), loop=0)
 
 
 def default_name() -> str:
@@ -139,7 +139,7 @@ def _scene(scene: ReplayScene, row: int, method: str, view: View, low: Floats, h
     shaded = Image.fromarray(np.ascontiguousarray(np.round(255.0 * image[::-1]).astype(np.uint8)), "RGBA")
     picture.alpha_composite(shaded, (0, _TALL - shaded.height))
     draw, track = ImageDraw.Draw(picture), scene.methods[method]
-    near = round(_PATH_S * RATE_HZ)
+    near = round(_PATH_S * scene.rate_hz)
     for points_m, first, last, colour in (
         (track.ref_m, row - near, row + near, _BLUE),
         (track.tcp_m, row - near, row, _ORANGE),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -26,8 +27,8 @@ from hrcreplay.robot.model import RobotModel, Segment
 from hrcreplay.settings.sections import setting
 from hrcreplay.store.run_folder import Run
 
-#: Rate of the replay [Hz].
-RATE_HZ = 25.0
+#: Rate of the replay [Hz], and the length of a run up to which it is whole; of a longer run the rate is lower [s].
+RATE_HZ, WHOLE_S = 25.0, 600.0
 #: Maximum rate of volumes in the replay [Hz].
 VOLUME_HZ = 12.5
 #: Maximum age of a row of a table at an instant [s].
@@ -146,7 +147,7 @@ class VolumeTrack:
 
 @dataclass(frozen=True)
 class ReplayScene:
-    """All moving parts of the 3-D replay, at ``RATE_HZ``."""
+    """All moving parts of the 3-D replay, at ``rate_hz``."""
 
     t0_ns: int  #: instant of time zero of the report
     t_ns: Ints  #: (n,)
@@ -161,6 +162,7 @@ class ReplayScene:
     objects: tuple[StaticHull, ...] = ()  #: convex parts of the objects of the cell, without half-spaces
     people: tuple[int, ...] = (1,)  #: (k,) numbers of the people
     cameras: tuple[CameraSight, ...] = ()
+    rate_hz: float = RATE_HZ
 
     @property
     def bones(self) -> Ints:
@@ -311,7 +313,8 @@ def replay_scene(
     if run.motion is None or len(run.motion) < 2 or "q1" not in run.motion:
         return None
     first, last = (int(t) for t in times(run.motion)[[0, -1]])
-    step_ns = round(1e9 / RATE_HZ)
+    every = max(1, math.ceil((last - first) * 1e-9 / WHOLE_S))
+    step_ns = every * round(1e9 / RATE_HZ)
     t_ns = first + step_ns * np.arange((last - first) // step_ns + 1)
     parts = tuple(part for part in radii_m if run.body is not None and f"{part}_0_x" in run.body)
     prefixes = sorted(method_prefixes(run).items(), key=lambda pair: pair[1] != "plan")
@@ -334,6 +337,7 @@ def replay_scene(
         objects=tuple(objects),
         people=run.people,
         cameras=tuple(camera_sights(run.meta)),
+        rate_hz=RATE_HZ / every,
     )
 
 

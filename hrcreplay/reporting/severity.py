@@ -43,6 +43,12 @@ NOTE = (
 NUMBERS = {field.name: float for field in fields(Impact) if field.type == "float"}
 
 
+#: Names of the figures of ``summary``.
+FIGURES = (
+    *("contacts", "contacts_over", "contacts_over_clamped", "contact_energy_max_j", "contact_force_share_max", "worst"),
+)
+
+
 def summary(rows: pd.DataFrame) -> dict[str, Any]:
     """Returns the severity of a method in figures; None if not known or without contact.
 

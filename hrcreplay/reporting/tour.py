@@ -10,7 +10,7 @@ import numpy as np
 
 from hrcreplay.records import RECORDED, Floats
 from hrcreplay.reporting.metrics.contact import StopEvent
-from hrcreplay.reporting.replay_scene import RATE_HZ, MethodTrack, ReplayScene
+from hrcreplay.reporting.replay_scene import MethodTrack, ReplayScene
 from hrcreplay.reporting.tables import part_name_text, reason_text
 
 #: Length of the tour [s], its largest number of stops, and the share of a stop before its moment.
@@ -63,7 +63,7 @@ def tour(scene: ReplayScene) -> tuple[TourStop, ...]:
     found: dict[int, tuple[str, str | None]] = {}
     for name in (own, *(name for name in (*_CARELESS, *others) if name in others)):
         for row, words in _worst_of(scene, name):
-            if len(found) < STOPS and all(abs(row - other) > RATE_HZ for other in found):
+            if len(found) < STOPS and all(abs(row - other) > scene.rate_hz for other in found):
                 found[row] = f"{name}: {words}", name if name != own else beside
     rows = sorted(found)
     return tuple(

@@ -49,7 +49,19 @@ SHORT = ("--start", 8, "--end", 8.4)
 def test_help_lists_every_command(run: Run) -> None:
     code, out, _ = run("--help")
     assert code == 0
-    for command in ("info", "import", "calibrate", "fuse", "predict", "plan", "report", "audit", "fit-limits", "demo"):
+    for command in (
+        "info",
+        "import",
+        "calibrate",
+        "fuse",
+        "predict",
+        "plan",
+        "report",
+        "audit",
+        "fit-limits",
+        "sweep",
+        "demo",
+    ):
         assert f" {command} " in out
 
 

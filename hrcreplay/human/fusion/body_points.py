@@ -38,7 +38,7 @@ _LOWER_ARMS = np.array([LIMBS.index("LRA"), LIMBS.index("LLA")])
 _ANKLES, _FEET = (np.array([POINTS.index(f"{part}_{side}") for side in "rl"]) for part in ("ankle", "foot"))
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def shift(filter_: Filter, p: Floats, points: Floats) -> None:
     """Adds the recent offsets to the model's points (20, 3) of a posture p (13,) [m]."""
     R = torso_rotation(p[2], p[3])
@@ -50,7 +50,7 @@ def shift(filter_: Filter, p: Floats, points: Floats) -> None:
         points[NECK, i] = 0.5 * (points[_SHOULDERS[0], i] + points[_SHOULDERS[1], i])
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def learn(
     filter_: Filter, c: int, now: int, shown: Bools, p: Floats, model: Floats, shifted: Floats, rules: Rules
 ) -> None:
@@ -85,7 +85,7 @@ def learn(
         _learn_legs(filter_, c, model[PELVIS], p[2], rules)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _learn_legs(filter_: Filter, c: int, pelvis: Floats, heading: float, rules: Rules) -> None:
     """Updates the legs below a pelvis (3,) by a camera's frame [m]."""
     for k in LEG_POINTS:
@@ -99,20 +99,20 @@ def _learn_legs(filter_: Filter, c: int, pelvis: Floats, heading: float, rules: 
             filter_.model.foot[side] = _turned(filter_.gate.points[c, foot] - filter_.gate.points[c, ankle], -heading)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _near(filter_: Filter, c: int, k: int, place: Floats, most: float, rules: Rules) -> bool:
     """Returns True if a camera shows a point with enough confidence within ``most`` [m] of a place."""
     shown = filter_.gate.confidence[c, k] >= rules.confidence_min
     return bool(shown and distance(filter_.gate.points[c, k], place) <= most)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _carry(filter_: Filter, c: int, k: int, relative: Floats) -> None:
     if filter_.gate.capture_ns[c] >= filter_.model.carried_ns[k]:
         filter_.model.carried[k], filter_.model.carried_ns[k] = relative, filter_.gate.capture_ns[c]
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def place(filter_: Filter, p: Floats, points: Floats) -> None:
     """Writes the points at the tick; NaN for hands and legs that no camera has observed recently.
 
@@ -136,7 +136,7 @@ def place(filter_: Filter, p: Floats, points: Floats) -> None:
             points[_FEET[side]] = points[_ANKLES[side]] + _turned(filter_.model.foot[side], p[2])
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _turned(vector: Floats, theta: float) -> Floats:
     """Rotates a vector (3,) about the vertical."""
     c, s = np.cos(theta), np.sin(theta)

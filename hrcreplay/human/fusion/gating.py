@@ -52,7 +52,7 @@ _STEP = 1e-5
 _UNKNOWN_M = 0.1
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def validate_frame(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> None:
     """Selects the valid rows of a new frame, 4.1.2 and Eq. (58), and the limbs that it shows completely.
 
@@ -90,7 +90,7 @@ def validate_frame(filter_: Filter, c: int, now: int, rules: Rules, track: Track
         filter_.gate.shows[c, limb] = agrees and product >= rules.confidence_min
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _validate_rows(filter_: Filter, c: int, trusted: Bools, rules: Rules) -> None:
     """Selects the valid rows, Eq. (58), from the trusted points (20,)."""
     confidence, points = filter_.gate.confidence[c], filter_.gate.points[c]
@@ -105,7 +105,7 @@ def _validate_rows(filter_: Filter, c: int, trusted: Bools, rules: Rules) -> Non
         filter_.gate.valid[c, row] = agrees and not blind and product >= rules.confidence_min
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _agreeing(filter_: Filter, c: int, now: int, whole: Bools, rules: Rules) -> tuple[Bools, Bools]:
     """Returns the points of a frame (20,) near the a-priori skeleton, and those accepted in spite of their distance.
 
@@ -139,7 +139,7 @@ def _agreeing(filter_: Filter, c: int, now: int, whole: Bools, rules: Rules) -> 
     return agreeing, believed
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _gates(filter_: Filter, c: int, now: int, rules: Rules) -> tuple[Floats, Floats]:
     """Returns the expected points in a camera's frame, (20, 3) [m], and their allowed errors, (20,) [m].
 
@@ -171,7 +171,7 @@ def _gates(filter_: Filter, c: int, now: int, rules: Rules) -> tuple[Floats, Flo
     return expected, rules.outlier_m + 3.0 * np.sqrt(variance)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _whole(filter_: Filter, c: int, now: int, rules: Rules) -> Bools:
     """Returns the points of a frame (20,) except those at the far end of a bone of wrong length.
 
@@ -192,7 +192,7 @@ def _whole(filter_: Filter, c: int, now: int, rules: Rules) -> Bools:
     return whole
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def distance(a: Floats, b: Floats) -> float:
     """Distance between two points (3,) [m]."""
     return np.sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)

@@ -72,7 +72,7 @@ def inverse(points_m: Floats) -> tuple[Floats, Floats]:
         be observed is 0.
     """
     rows = np.full((len(points_m), ROWS), np.nan)
-    _inverse_rows(np.ascontiguousarray(points_m, dtype=np.float64), rows)
+    _inverse_rows(np.array(points_m, dtype=np.float64, order="C"), rows)  # a copy: as writable as those of `measure`
     return rows[:, :DOF].copy(), rows[:, DOF:].copy()
 
 
@@ -141,7 +141,7 @@ def _measure_rows(
                 variances[i, row] = np.nan
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _variances_row(points: Floats, point_variance: Floats, variances: Floats) -> None:
     """Eq. (47), variance of every row from the squared Jacobian; to second order it exceeds the range of an angle."""
     J = inverse_jacobian(points)
@@ -182,13 +182,13 @@ def inverse_jacobian(points: Floats) -> Floats:
     return J
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _name_arms(rows: Floats) -> None:
     for first in (RIGHT_ARM, LEFT_ARM):
         canonical_arm(rows[first : first + 4], 0.0)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _direct_row(points: Floats, rows: Floats) -> None:
     """Computes the joints and lengths of one skeleton (20, 3), arms in the form with |alpha_2| <= 90 degrees."""
     pelvis, right, left = _point(points, PELVIS), _point(points, _SHOULDER_R), _point(points, _SHOULDER_L)
@@ -222,7 +222,7 @@ def _direct_row(points: Floats, rows: Floats) -> None:
         rows[first + 3] = _elbow_angle((-upper[0], -upper[1], -upper[2]), fore)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _bone(ends: Vector) -> Vector:
     """Returns the bone, or NaN if both ends coincide: that bone cannot be observed."""
     if norm(ends) < LEAST_BONE_M:
@@ -230,7 +230,7 @@ def _bone(ends: Vector) -> Vector:
     return ends
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _in_torso(R: Floats, s: float, bone: Vector) -> Vector:
     """Transforms a bone into the torso's frame, mirrored in y for a right arm (s = -1)."""
     x, y, z = bone
@@ -241,7 +241,7 @@ def _in_torso(R: Floats, s: float, bone: Vector) -> Vector:
     )
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _arm_row(upper: Vector, fore: Vector, arm: Floats) -> None:
     """Computes alpha_1 to alpha_3 of a left arm whose bones point along upper and fore in the torso's frame."""
     across = np.hypot(upper[1], upper[2])
@@ -252,22 +252,22 @@ def _arm_row(upper: Vector, fore: Vector, arm: Floats) -> None:
     arm[2] = np.arctan2(c1 * fore[1] + s1 * fore[2], c2 * fore[0] + s2 * lifted)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _elbow_angle(a: Vector, b: Vector) -> float:
     """Computes the angle at the elbow, pi when straight; unlike an arc cosine, it is exact near both ends."""
     return np.arctan2(norm(cross(a, b)), dot(a, b))
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _point(points: Floats, k: int) -> Vector:
     return points[k, 0], points[k, 1], points[k, 2]
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _from_to(a: Vector, b: Vector) -> Vector:
     return b[0] - a[0], b[1] - a[1], b[2] - a[2]
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _middle(a: Vector, b: Vector) -> Vector:
     return 0.5 * (a[0] + b[0]), 0.5 * (a[1] + b[1]), 0.5 * (a[2] + b[2])

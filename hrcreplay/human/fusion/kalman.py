@@ -142,7 +142,7 @@ class Track(NamedTuple):
     saturated: Ints  #: (1,)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def delay(filter_: Filter, c: int, now: int, rules: Rules) -> float:
     """Age of the stored frame of a camera [s]; 0 if delays are ignored.
 
@@ -157,7 +157,7 @@ def delay(filter_: Filter, c: int, now: int, rules: Rules) -> float:
     return max(0.0, min((now - filter_.gate.capture_ns[c]) * 1e-9, rules.delay_max_s))
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def predict(mean: Floats, P: Floats, dt: float, damping: float, sigma: Floats, rest_std: Floats) -> None:
     """Eq. (42), (48), (49) over dt seconds, mean (4,) and P (4, 4) in place.
 
@@ -187,7 +187,7 @@ def predict(mean: Floats, P: Floats, dt: float, damping: float, sigma: Floats, r
         P[a, a] += process_variance(a, dt, damping, sigma, rest_std)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _ahead(taylor: tuple[float, float, float, float], x: Floats, a: int) -> float:
     """Row a of F times x (4,)."""
     total = x[a]
@@ -196,7 +196,7 @@ def _ahead(taylor: tuple[float, float, float, float], x: Floats, a: int) -> floa
     return total
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def correct(mean: Floats, P: Floats, h: Floats, z: float, R: float) -> float:
     """Eq. (52)-(57) for one joint and one scalar row; returns the normalised innovation, over its standard deviation.
 
@@ -239,13 +239,13 @@ def process_variance(a: int, dt: float, damping: float, sigma: Floats, rest_std:
     return sigma[a] ** 2 * remainder[a] + forgotten
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def extrapolate_back(mean: Floats, d: float) -> Floats:
     """Extrapolates joint positions (13,) d seconds back, by the Taylor polynomial of Eq. (43)."""
     return mean[:, 0] - d * mean[:, 1] + d**2 / 2.0 * mean[:, 2] - d**3 / 6.0 * mean[:, 3]
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def dot(a: Floats, b: Floats) -> float:
     """The scalar product of (4,) and (4,)."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]

@@ -35,7 +35,7 @@ def run(ticks_ns: Ints, frames: Frames, filter_: Filter, rules: Rules, track: Tr
         track: Arrays for n ticks; receive the states and the counts of events.
     """
     damping = np.ones(DOF)
-    seen = 0
+    seen = np.int64(0)  # numba would compile `_collect` once more for the constant 0
     for k in range(len(ticks_ns)):
         now = ticks_ns[k]
         dt = (now - filter_.estimate.tick_ns[0]) * 1e-9 if filter_.estimate.started[0] else 0.0
@@ -60,7 +60,7 @@ def run(ticks_ns: Ints, frames: Frames, filter_: Filter, rules: Rules, track: Tr
             _leave(filter_, k, rules, track, damping)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _predict(filter_: Filter, now: int, rules: Rules, damping: Floats) -> None:
     """Computes the a-priori estimate, Eq. (48), (49).
 
@@ -72,7 +72,7 @@ def _predict(filter_: Filter, now: int, rules: Rules, damping: Floats) -> None:
         predict(filter_.estimate.mean[j], filter_.estimate.cov[j], dt, damping[j], rules.sigma[j], rules.rest_std[j])
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _collect(frames: Frames, seen: int, now: int, filter_: Filter, track: Track) -> int:
     """Stores the newest arrived frame of each camera; returns the number of frames processed."""
     while seen < len(frames.arrival_ns) and frames.arrival_ns[seen] <= now:
@@ -92,7 +92,7 @@ def _collect(frames: Frames, seen: int, now: int, filter_: Filter, track: Track)
     return seen
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _update(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> bool:
     """Applies Eq. (52)-(57) with the valid rows of one camera's frame, row by row; returns True if there was one.
 
@@ -131,7 +131,7 @@ def _update(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> bo
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _named(filter_: Filter, c: int, h: Floats) -> Floats:
     """Returns the rows (20,) of a camera's frame, arms in the form and heading in the turn nearest to the estimate."""
     z = filter_.gate.z[c].copy()
@@ -150,7 +150,7 @@ def _named(filter_: Filter, c: int, h: Floats) -> Floats:
     return z
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _start(filter_: Filter, c: int) -> None:
     """Starts the person, with the base under the seen points until the pelvis is seen."""
     filter_.estimate.started[0] = True
@@ -158,7 +158,7 @@ def _start(filter_: Filter, c: int) -> None:
         filter_.estimate.mean[axis, 0] = np.nanmean(filter_.gate.points[c, :, axis])
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _acquire(filter_: Filter, j: int, z: float, R: float, rest_std: Floats) -> None:
     """Starts a joint seen for the first time or after a loss; no earlier state is kept."""
     filter_.estimate.mean[j] = 0.0
@@ -170,7 +170,7 @@ def _acquire(filter_: Filter, j: int, z: float, R: float, rest_std: Floats) -> N
         filter_.estimate.cov[j, k + 1, k + 1] = rest_std[k] ** 2
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _rename(filter_: Filter) -> None:
     """Keeps the angles of each arm near the canonical form. The posture is unchanged: alpha_2 is mirrored, P stays."""
     for first in (RIGHT_ARM, LEFT_ARM):
@@ -180,7 +180,7 @@ def _rename(filter_: Filter) -> None:
         filter_.estimate.mean[first : first + 4, 0] = arm
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _leave(filter_: Filter, k: int, rules: Rules, track: Track, damping: Floats) -> None:
     for j in range(DOF):
         for a in range(4):
@@ -201,7 +201,7 @@ def _leave(filter_: Filter, k: int, rules: Rules, track: Track, damping: Floats)
             track.autocorrelation[k, j] = autocorrelation(filter_, j)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def saturate(mean: Floats, dt: float, rules: Rules) -> bool:
     """Eq. (62)-(65) on the state of all joints (13, 4), then the same for the accelerations, in place.
 
@@ -228,7 +228,7 @@ def saturate(mean: Floats, dt: float, rules: Rules) -> bool:
     return bool((before != mean[:, :3]).any())
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _clip(
     rate: Floats, value: Floats, low: Floats, high: Floats, rate_low: Floats, rate_high: Floats, dt: float
 ) -> Floats:
@@ -243,7 +243,7 @@ def _clip(
     return clipped
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _into_body(world: Floats, theta: float) -> Floats:
     """Eq. (33): returns the first two of (13,) as forward and to the left."""
     body = world.copy()
@@ -252,7 +252,7 @@ def _into_body(world: Floats, theta: float) -> Floats:
     return body
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _write(world: Floats, body: Floats, clipped: Floats, theta: float) -> None:
     """Eq. (32): writes back only what was clipped, so that the rest keeps its bits."""
     world[2:] = clipped[2:]

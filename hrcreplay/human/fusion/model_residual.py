@@ -51,7 +51,7 @@ _HIPS = np.array([POINTS.index(f"hip_{side}") for side in "rl"])
 _BELOW = np.array([POINTS.index(f"{part}_{side}") for part in ("knee", "ankle", "foot") for side in "rl"])
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def observe(filter_: Filter, fresh: Bools, now: int, rules: Rules) -> None:
     """Adds the samples of the cameras' new frames and recomputes the quantiles of those limbs.
 
@@ -81,7 +81,7 @@ def observe(filter_: Filter, fresh: Bools, now: int, rules: Rules) -> None:
             below = _farthest(filter_, c, _BELOW, model[PELVIS], rules)
             if below >= 0.0:
                 sample = max(below, _farthest(filter_, c, _HIPS, model[PELVIS], rules))
-                _enter(filter_, _LEGS, now, sample, rules)
+                _enter(filter_, np.int64(_LEGS), now, sample, rules)  # as above: numba compiles constants anew
         learn(filter_, c, now, shown, p, plain, model, rules)
     for limb in np.flatnonzero(filter_.model.sampled_ns == now):
         if filter_.model.samples[limb] >= LEAST:
@@ -89,7 +89,7 @@ def observe(filter_: Filter, fresh: Bools, now: int, rules: Rules) -> None:
             filter_.model.residual[limb] = _exceeded_by(filter_.model.residuals[limb], larger)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _depart(filter_: Filter, c: int, model: Floats, now: int, rules: Rules) -> None:
     """Writes the distance of each limb's rejected points in a camera's frame from the model (20, 3) [m].
 
@@ -109,7 +109,7 @@ def _depart(filter_: Filter, c: int, model: Floats, now: int, rules: Rules) -> N
                 filter_.gate.apart[c, limb] = max(filter_.gate.apart[c, limb], distance(here, model[k]))
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def write_residual(filter_: Filter, now: int, rules: Rules, residual: Floats) -> None:
     """Writes the residual of each limb of BODY used at a tick, (7,) [m]; NaN until known.
 
@@ -133,7 +133,7 @@ def write_residual(filter_: Filter, now: int, rules: Rules, residual: Floats) ->
                     residual[limb] = np.fmax(residual[limb], filter_.gate.apart[c, limb])
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _farthest(filter_: Filter, c: int, points: Ints, pelvis: Floats, rules: Rules) -> float:
     """Returns the maximum distance of leg points from the line below the pelvis (3,) [m]; -1 if none is seen."""
     farthest = -1.0
@@ -146,7 +146,7 @@ def _farthest(filter_: Filter, c: int, points: Ints, pelvis: Floats, rules: Rule
     return farthest
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _settled(filter_: Filter, limb: int, now: int, rules: Rules) -> bool:
     """Returns True if no joint that carries the limb is lost or has restarted recently."""
     root = 2 if limb == _LEGS else 4
@@ -160,7 +160,7 @@ def _settled(filter_: Filter, limb: int, now: int, rules: Rules) -> bool:
     return now - newest > rules.memory_ns and now - last <= rules.memory_ns
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def write_unseen_times(filter_: Filter, seconds: Floats) -> None:
     """Writes the time since the last valid row of each limb's own joints, (7,) [s]; for the legs, knees and ankles.
 
@@ -174,12 +174,12 @@ def write_unseen_times(filter_: Filter, seconds: Floats) -> None:
     seconds[_LEGS] = _since(now, filter_.model.carried_ns[BENDS].min())
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _since(now: int, then: int) -> float:
     return (now - then) * 1e-9 if then >= 0 else np.inf
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _enter(filter_: Filter, limb: int, now: int, sample: float, rules: Rules) -> None:
     """Reduces the weights of a limb's earlier samples and adds one of weight 1; ignores a sample that is not finite."""
     if not sample >= 0.0:
@@ -195,7 +195,7 @@ def _enter(filter_: Filter, limb: int, now: int, sample: float, rules: Rules) ->
     filter_.model.sampled_ns[limb] = now
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _exceeded_by(weights: Floats, larger: float) -> float:
     """Returns the smallest upper end of a bin such that the samples above it have at most this weight [m]."""
     above = 0.0

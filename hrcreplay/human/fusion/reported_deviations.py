@@ -42,14 +42,14 @@ FITTED = np.array(
 )
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def reset(filter_: Filter, j: int) -> None:
     """Resets joint j after its acquisition, without an innovation."""
     filter_.estimate.innovation[:, j], filter_.estimate.squares[j], filter_.estimate.products[j] = 0.0, 0.0, 0.0
     filter_.estimate.spread[j] = FIRST_SPREAD
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def add_innovation(filter_: Filter, c: int, j: int, innovation: float, now: int, rules: Rules) -> None:
     """Adds a normalised innovation of joint j; ``row_ns`` is still the tick of the previous one.
 
@@ -69,7 +69,7 @@ def add_innovation(filter_: Filter, c: int, j: int, innovation: float, now: int,
     filter_.estimate.spread[j] = max(np.exp(-age_s / rules.spread_memory_s) * filter_.estimate.spread[j], innovation**2)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def autocorrelation(filter_: Filter, j: int) -> float:
     """Autocorrelation of joint j's innovations by the same camera, at lag 1, in [-1, 1]; 0 without innovations."""
     if not 0.0 < filter_.estimate.squares[j] < np.inf:
@@ -77,7 +77,7 @@ def autocorrelation(filter_: Filter, j: int) -> float:
     return float(max(-1.0, min(filter_.estimate.products[j] / filter_.estimate.squares[j], 1.0)))
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def variance_factor(filter_: Filter, j: int, a: int, rules: Rules) -> float:
     """Factor on the variance of a joint; at least 1 while it coasts, as there are then no innovations.
 

@@ -41,7 +41,6 @@ from hrcreplay.reporting.figures.scene import (
 )
 from hrcreplay.reporting.metrics.series import seconds_from
 from hrcreplay.reporting.replay_scene import (
-    RATE_HZ,
     VOLUME_HZ,
     MethodTrack,
     ReplayScene,
@@ -215,7 +214,7 @@ def replay_data(scene: ReplayScene, *, budget_bytes: int = BUDGET_BYTES) -> tupl
 def _header(scene: ReplayScene) -> dict[str, Any]:
     robot = scene.robot
     return {
-        "rate_hz": RATE_HZ,
+        "rate_hz": scene.rate_hz,
         "count": len(scene.t_ns),
         "start_s": round((int(scene.t_ns[0]) - scene.t0_ns) * 1e-9, 6),
         "bones": scene.bones.tolist(),
@@ -437,7 +436,7 @@ def draw_instant(
     limits = axes.get_xlim(), axes.get_ylim()
     extent = (float(low[0]), float(high[0]), float(low[1]), float(high[1]))
     axes.imshow(image, origin="lower", extent=extent, aspect="auto", interpolation="bilinear", zorder=2)
-    around = slice(max(0, row - round(_PATH_S * RATE_HZ)), row + round(_PATH_S * RATE_HZ) + 1)
+    around = slice(max(0, row - round(_PATH_S * scene.rate_hz)), row + round(_PATH_S * scene.rate_hz) + 1)
     axes.plot(*view.flat(track.ref_m[around]).T, color=drawing.NOMINAL, lw=1.2, zorder=3)
     driven = slice(around.start if since is None else since, row + 1)
     axes.plot(*view.flat(track.tcp_m[driven]).T, color=drawing.ACTUAL, lw=1.4, zorder=4)
