@@ -1,5 +1,8 @@
 """The command ``bench``: the time of every stage on a log, beside well-known programs for the same tasks in one run.
 
+A stage has its mean in batches, as a replay runs it, and its times tick by tick, both with the work around it: tables,
+contact, distances for the record. The decision of the method, from the people to the certified step, is timed alone.
+
 References: filterpy's dense Kalman filter over the same states, Qhull on the vertices that the volumes have, and daqp
 on the controller's cost with one row per link and vertex. They are timed without the work around them.
 """
@@ -10,6 +13,7 @@ import resource
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -37,6 +41,8 @@ from hrcreplay.store.run_folder import Stopwatch
 
 #: Length of the stretch that is timed, and largest number of ticks for a reference.
 SECONDS, FEW = 20.0, 500
+#: Ticks of a batch.
+BATCH = 250
 #: Vertices of a volume this near to a plane lie in it [m].
 _FLAT_M = 1e-6
 _MB = 1024.0
@@ -51,7 +57,8 @@ class BenchRow:
     median_us: float
     p99_us: float
     max_us: float
-    real_time_factor: float  #: of the stage in batches; of a reference, of its ticks
+    mean_us: float  #: of a stage, in batches
+    real_time_factor: float  #: by the mean
     reference: bool = False
 
 
@@ -112,26 +119,30 @@ def run(
     ticks_ns = stages.span_ticks(run_config, open_log(run_config.log, run_config.settings.logs))
     period_s = 1.0 / run_config.settings.fusion.rate_hz
     progress.begin("stages in batches", len(ticks_ns))
-    batches, _, _ = _time_stages(run_config, ticks_ns, 250, progress)
+    batches, _, _ = _time_stages(run_config, ticks_ns, BATCH, progress)
     progress.begin("stages tick by tick", len(ticks_ns))
     single, kept, states = _time_stages(run_config, ticks_ns, 1, progress)
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / _MB
     rows = []
     for name, one in single.summary(period_s).items():
         factor = batches.summary(period_s)[name]["real_time_factor"]
-        rows.append(BenchRow(name, one["ticks"], one["median_us"], one["p99_us"], one["max_us"], factor))
+        mean_us = 1e6 * period_s / factor
+        rows.append(BenchRow(name, one["ticks"], one["median_us"], one["p99_us"], one["max_us"], mean_us, factor))
+    progress.begin("decisions", len(ticks_ns))
+    decisions = _time_decisions(run_config, states, progress)
+    rows += [_summarise(name, took_us, period_s, reference=False) for name, took_us in decisions.items()]
     progress.begin("references")
     references, missing = _time_references(run_config, kept, states)
-    rows += [_summarise(name, took_us, period_s) for name, took_us in references.items()]
+    rows += [_summarise(name, took_us, period_s, reference=True) for name, took_us in references.items()]
     length_s = float(ticks_ns[-1] - ticks_ns[0]) * 1e-9
     return BenchResult(run_config.log.name, length_s, 1.0 / period_s, peak_mb, tuple(rows), missing)
 
 
-def _summarise(name: str, took_us: Floats, period_s: float) -> BenchRow:
-    """Summarises the times of a reference."""
-    median, p99 = np.quantile(took_us, [0.5, 0.99])
-    factor = 1e6 * period_s / float(took_us.mean())
-    return BenchRow(name, len(took_us), float(median), float(p99), float(took_us.max()), factor, reference=True)
+def _summarise(name: str, took_us: Floats, period_s: float, *, reference: bool) -> BenchRow:
+    """Summarises the times of single calls."""
+    median, p99 = np.quantile(took_us, [0.5, 0.99]).tolist()
+    mean_us, max_us = float(took_us.mean()), float(took_us.max())
+    return BenchRow(name, len(took_us), median, p99, max_us, mean_us, 1e6 * period_s / mean_us, reference)
 
 
 def _time_stages(
@@ -139,7 +150,12 @@ def _time_stages(
 ) -> tuple[Stopwatch, _Kept, HumanStates]:
     """Runs all stages in batches of ``size`` ticks; returns times, tables and the people."""
     log, kept = open_log(run_config.log, run_config.settings.logs), _Kept()
-    sink = Sink(kept, Stopwatch(time.perf_counter_ns), lambda _, ticks: progress.advance(_part(size), ticks))
+
+    def advance(stage: str, ticks: int) -> None:
+        if stage == "plan":  # the last one
+            progress.advance(_part(size), ticks)
+
+    sink = Sink(kept, Stopwatch(time.perf_counter_ns), advance)
     states: list[HumanStates] = []
 
     def keep(parts: Iterable[HumanStates]) -> Iterator[HumanStates]:
@@ -154,6 +170,36 @@ def _time_stages(
     for _ in stages.plan_batches(keep(fused), assembly.surroundings(run_config, robot), moved, every, sink):
         pass
     return sink.watch, kept, HumanStates.join(states)
+
+
+def _time_decisions(run_config: RunConfig, states: HumanStates, progress: Progress) -> dict[str, Floats]:
+    """Times the decisions of the chosen method; returns those and the times of their volumes, (n,) each [us].
+
+    As in a replay, the people of a batch are prepared for all horizons first; that counts to the batch's first tick.
+    """
+    log, method = open_log(run_config.log, run_config.settings.logs), run_config.settings.plan.method
+    robot = assembly.robot(run_config, assembly.robot_base(run_config, log))
+    around, clock = assembly.surroundings(run_config, robot), time.perf_counter_ns
+    t_ns, first = states.ticks()
+    programme = assembly.programme(run_config, log, robot)
+    controller = assembly.planners(run_config, programme, int(t_ns[0]))[method].controller
+    took, volumes = np.empty(len(t_ns)), np.zeros(len(t_ns))
+    for begin in range(0, len(t_ns), BATCH):
+        end = min(begin + BATCH, len(t_ns))
+        forecast = Forecast(around, states.rows(slice(int(first[begin]), int(first[end]))))
+
+        def look(tick: int, horizon_s: float, begin: int = begin, forecast: Forecast = forecast) -> Obstacles:
+            start_ns = clock()
+            found = forecast.obstacles(tick - begin, horizon_s)
+            volumes[tick] += clock() - start_ns
+            return found
+
+        for tick in range(begin, end):
+            start_ns = clock()
+            controller.step(partial(look, tick))
+            took[tick] = clock() - start_ns
+        progress.advance("decisions", end - begin)
+    return {f"decision of {method}": took / 1e3, "volumes of a decision": volumes / 1e3}
 
 
 def _part(size: int) -> str:
@@ -271,10 +317,12 @@ def print_table(found: BenchResult, console: Console) -> None:
         title_justify="left",
     )
     table.add_column("stage")
-    for heading in ("ticks", "median us", "p99 us", "max us", "times real time"):
+    for heading in ("ticks", "median us", "p99 us", "max us", "mean us", "times real time"):
         table.add_column(heading, justify="right")
     for row in sorted(found.rows, key=lambda row: row.reference):
-        numbers = (f"{value:,.1f}" for value in (row.median_us, row.p99_us, row.max_us, row.real_time_factor))
+        numbers = (
+            f"{value:,.1f}" for value in (row.median_us, row.p99_us, row.max_us, row.mean_us, row.real_time_factor)
+        )
         table.add_row(row.name, f"{row.ticks:,}", *numbers)
     console.print(table)
     for name in found.missing:

@@ -23,11 +23,13 @@ def test_every_stage_and_reference_is_timed() -> None:
     found = bench.run(replay.demo_log(), **how)
     rows = {row.name: row for row in found.rows}
     assert {"angles", "fuse", "predict", "plan qp", "plan none", "hulls"} <= set(rows)
+    assert {"decision of qp", "volumes of a decision"} < set(rows)
+    assert rows["volumes of a decision"].mean_us < rows["decision of qp"].mean_us, "a part of it"
     assert {"filterpy: dense filter", "qhull: hulls of their vertices"} < set(rows)
     assert rows["fuse"].ticks == 76  # 0.3 s at 250 Hz, both ends
     for row in found.rows:
         assert 0.0 < row.median_us <= row.p99_us <= row.max_us
-        assert row.real_time_factor > 0.0
+        assert row.real_time_factor == pytest.approx(4000.0 / row.mean_us)
     assert found.peak_mb > 50.0
     assert json.loads(json.dumps(found.to_dict()))["rows"][0]["name"] == found.rows[0].name
     console = Console(width=160, record=True, quiet=False)
