@@ -7,12 +7,9 @@ an earlier run with the same settings is reused; its metrics are computed again.
 
 from __future__ import annotations
 
-import multiprocessing
 import shutil
-import signal
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
@@ -42,6 +39,7 @@ from hrcreplay.pipeline.kernel_build import ensure_compiled
 from hrcreplay.pipeline.progress import ProgressBar, print_note
 from hrcreplay.pipeline.robot_mass import robot_mass
 from hrcreplay.pipeline.run_config import RunConfig, RunOptions, resolve
+from hrcreplay.pipeline.second_process import second_process
 from hrcreplay.pipeline.stages import Sink, collect_plan_findings
 from hrcreplay.records import RECORDED, UNGUARDED, Floats, Ints
 from hrcreplay.reporting import comparison
@@ -385,28 +383,16 @@ def _plan_all(tasks: Sequence[VariantTask], processes: int, advance: Callable[[i
     if processes < 2 or len(order) < 2:
         return {task.variant: plan(task, advance)[1] for task in order}
     took = {}
-    with _second_process() as pool:
+    with second_process() as pool:
         futures = [pool.submit(plan, task) for task in order]
-        try:
-            for task, future in zip(order, futures, strict=True):
-                if future.cancel():
-                    took[task.variant] = plan(task, advance)[1]
-            for task, future in zip(order, futures, strict=True):
-                if not future.cancelled():
-                    ticks, took[task.variant] = future.result()
-                    advance(ticks)
-        except BaseException:
-            for process in multiprocessing.active_children():  # otherwise it would continue to the end of its task
-                process.terminate()
-            pool.shutdown(cancel_futures=True)
-            raise
+        for task, future in zip(order, futures, strict=True):
+            if future.cancel():
+                took[task.variant] = plan(task, advance)[1]
+        for task, future in zip(order, futures, strict=True):
+            if not future.cancelled():
+                ticks, took[task.variant] = future.result()
+                advance(ticks)
     return took
-
-
-def _second_process() -> ProcessPoolExecutor:
-    """Starts a process that ignores Ctrl-C: the first process ends it."""
-    spawn = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(1, spawn, initializer=signal.signal, initargs=(signal.SIGINT, signal.SIG_IGN))
 
 
 def plan(task: VariantTask, progress: Callable[[int], None] | None = None) -> tuple[int, float]:

@@ -6,9 +6,12 @@ Stages of an earlier run are reused if the digests of their inputs are unchanged
 from __future__ import annotations
 
 import math
+import os
 import time
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import Executor, Future
+from contextlib import ExitStack
 from datetime import UTC, datetime
 from importlib import resources
 from pathlib import Path
@@ -23,8 +26,9 @@ from hrcreplay.pipeline.kernel_build import ensure_compiled
 from hrcreplay.pipeline.progress import NO_PROGRESS, Progress, ProgressBar, print_note
 from hrcreplay.pipeline.robot_mass import robot_mass
 from hrcreplay.pipeline.run_config import RunConfig, RunOptions, resolve
+from hrcreplay.pipeline.second_process import MANY, second_process
 from hrcreplay.pipeline.stages import Sink, Told, collect_fusion_findings, collect_plan_findings
-from hrcreplay.records import HumanStates, Ints
+from hrcreplay.records import RECORDED, HumanStates, Ints
 from hrcreplay.reporting import tables
 from hrcreplay.reporting.summary_text import defect_notes
 from hrcreplay.store import run_folder
@@ -62,10 +66,13 @@ def run(
     """
     began = datetime.now(UTC)
     run_config = resolve(command, source, **options)
-    return execute(run_config, out or _folder(run_config, began), smooth=smooth, chunk_ticks=chunk_ticks)
+    folder, processes = out or _folder(run_config, began), min(2, os.cpu_count() or 1)
+    return execute(run_config, folder, smooth=smooth, chunk_ticks=chunk_ticks, processes=processes)
 
 
-def execute(run_config: RunConfig, folder: Path, *, smooth: bool = False, chunk_ticks: int = 250) -> Path:
+def execute(
+    run_config: RunConfig, folder: Path, *, smooth: bool = False, chunk_ticks: int = 250, processes: int = 1
+) -> Path:
     """Runs the stages of a resolved run and writes its folder.
 
     Args:
@@ -73,6 +80,7 @@ def execute(run_config: RunConfig, folder: Path, *, smooth: bool = False, chunk_
         folder: Run folder to make.
         smooth: True: also write the smoothed person (smooth.parquet).
         chunk_ticks: Ticks of a batch; changes no result.
+        processes: 2: a second process shares the work of a long run; changes no result.
 
     Returns:
         The run folder.
@@ -83,7 +91,9 @@ def execute(run_config: RunConfig, folder: Path, *, smooth: bool = False, chunk_
     """
     began, known = datetime.now(UTC), run_config.meta()
     ensure_compiled()
-    with RunWriter(folder) as writer, ProgressBar(f"reading {run_config.log.name}") as bar:
+    with ExitStack() as held:
+        writer = held.enter_context(RunWriter(folder))
+        bar = held.enter_context(ProgressBar(f"reading {run_config.log.name}"))
         log = open_log(run_config.log, run_config.settings.logs)
         ticks_ns = stages.span_ticks(run_config, log)
         parts = reuse.dependencies(run_config, log, ticks_ns)
@@ -92,12 +102,13 @@ def execute(run_config: RunConfig, folder: Path, *, smooth: bool = False, chunk_
             bar.begin(stage, len(ticks_ns))
         sink = Sink(writer, Stopwatch(time.perf_counter_ns), bar.advance)
         compared = run_config.command == "report" and not log.header.has_truth  # this then includes the smoothed person
-        told = run_stages(
-            run_config, log, ticks_ns, chunk_ticks, sink, reused, folder=writer.partial, smooth=smooth or compared
-        )
+        two = processes > 1 and len(ticks_ns) >= MANY and "plan" in run_config.stages
+        second = held.enter_context(second_process()) if two else None
+        how: Any = {"folder": writer.partial, "smooth": smooth or compared, "second": second}
+        told = run_stages(run_config, log, ticks_ns, chunk_ticks, sink, reused, **how)
         found = findings(run_config, told, reused)
         meta = {**known, **found, **describe_run(run_config, began, parts, smooth=smooth)}
-        complete(run_config, log, writer, sink.watch, meta, bar)
+        complete(run_config, log, writer, sink.watch, meta, bar, second)
         return writer.folder
 
 
@@ -125,6 +136,7 @@ def complete(
     watch: Stopwatch,
     meta: dict[str, Any],
     progress: Progress = NO_PROGRESS,
+    second: Executor | None = None,
 ) -> None:
     """Completes a run whose stages have written their tables; also makes the report if requested.
 
@@ -135,6 +147,7 @@ def complete(
         watch: Times of the stages; the times of the report are added.
         meta: Entries of run.json so far.
         progress: Receives the progress.
+        second: A second process; None: no such process.
     """
     base = assembly.known_robot_base(run_config, log)
     if log.header.joint_topics or meta["counts"].get("joint_gaps_ms"):
@@ -145,13 +158,19 @@ def complete(
         print_note(line)
     meta["T_world_base"] = None if base is None else base.tolist()
     if run_config.command == "report":
-        _report(run_config, log, writer, watch, meta, progress)
+        _report(run_config, log, writer, watch, meta, progress, second)
     writer.timing.update(watch.summary(1.0 / run_config.settings.fusion.rate_hz))
     writer.finish(meta)
 
 
 def _report(
-    run_config: RunConfig, log: Log, writer: RunWriter, watch: Stopwatch, meta: dict[str, Any], progress: Progress
+    run_config: RunConfig,
+    log: Log,
+    writer: RunWriter,
+    watch: Stopwatch,
+    meta: dict[str, Any],
+    progress: Progress,
+    second: Executor | None,
 ) -> None:
     """Writes the contact table and the report of a run whose other tables are written."""
     from hrcreplay.commands.report import write_report
@@ -162,7 +181,7 @@ def _report(
     ticks = pq.read_metadata(writer.partial / "state.parquet").num_rows
     progress.begin("contact")
     with watch.stage("contact", ticks):
-        write_contact(run_config, log, writer, assembly.robot_base(run_config, log))
+        write_contact(run_config, log, writer, assembly.robot_base(run_config, log), second)
     with watch.stage("report", ticks):
         write_report(run_config, writer, meta, log, progress)
 
@@ -177,6 +196,7 @@ def run_stages(
     *,
     folder: Path,
     smooth: bool,
+    second: Executor | None = None,
 ) -> dict[str, Told]:
     """Runs all stages in one pass, except those whose tables were reused.
 
@@ -189,6 +209,7 @@ def run_stages(
         reused: Stages whose tables were copied from an earlier run.
         folder: Folder of those tables.
         smooth: True: also write the smoothed person.
+        second: A second process, which moves the robot by the baselines; None: no such process.
 
     Returns:
         The findings of the stages that read the log.
@@ -201,6 +222,7 @@ def run_stages(
     else:
         states = read_states(folder / "state.parquet", size)
     flow: Iterable[Any] = states
+    elsewhere: Future[dict[str, Any]] | None = None
     if "plan" in todo:
         robot = assembly.robot(run_config, assembly.robot_base(run_config, log))
         programme = assembly.programme(run_config, log, robot)
@@ -208,6 +230,12 @@ def run_stages(
         moved = assembly.followers(run_config, programme, int(ticks_ns[0]))
         sink.notes["plan"].extend(assembly.scene_notes(run_config, log, moved))
         every = stages.store_every(run_config) if "predict" in todo else math.inf
+        others = [name for name, one in moved.items() if not one.chosen and name != RECORDED]
+        if second is not None and others:
+            elsewhere = second.submit(
+                follow_methods, run_config, ticks_ns, size, others, folder, fused_before="fuse" not in todo
+            )
+            moved = {name: one for name, one in moved.items() if name not in others}
         flow = stages.plan_batches(states, assembly.surroundings(run_config, robot), moved, every, sink)
     elif "predict" in todo:
         flow = stages.predict_batches(
@@ -216,7 +244,58 @@ def run_stages(
     if todo:
         for _ in flow:
             pass
+    if elsewhere is not None:
+        sink.watch.calls.update(elsewhere.result())
     return {"fuse": collect_fusion_findings(log, sink), "plan": collect_plan_findings(log, sink)}
+
+
+class _MotionsAlone:
+    """Writes the tables of motions into a folder, and drops the rest."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._tables = folder, dict[str, run_folder.TableWriter]()
+
+    def table(self, name: str, columns: Mapping[str, Any], /) -> None:
+        """Appends rows to the table of a motion."""
+        if name.startswith("motion_"):
+            if name not in self._tables:
+                self._tables[name] = run_folder.TableWriter(self._folder / f"{name}.parquet")
+            self._tables[name].write(columns)
+
+    def close(self) -> None:
+        """Completes the tables."""
+        for table in self._tables.values():
+            table.close()
+
+
+def follow_methods(
+    run_config: RunConfig, ticks_ns: Ints, size: int, names: Sequence[str], folder: Path, *, fused_before: bool
+) -> dict[str, list[tuple[int, int]]]:
+    """Moves the robot by some methods of a run, in a process that fuses the people for itself, as that is fast.
+
+    Args:
+        run_config: The run.
+        ticks_ns: (n,) ticks of the run [ns].
+        size: Ticks of a batch.
+        names: The methods; none is the chosen one.
+        folder: Receives the tables of their motions.
+        fused_before: True: the folder already has state.parquet.
+
+    Returns:
+        Stage -> ticks and duration [ns] of each call.
+    """
+    log, tables = open_log(run_config.log, run_config.settings.logs), _MotionsAlone(folder)
+    sink = Sink(tables, Stopwatch(time.perf_counter_ns), NO_PROGRESS.advance)
+    states: Iterable[HumanStates] = read_states(folder / "state.parquet", size)
+    if not fused_before:
+        states = stages.fuse_batches(log, ticks_ns, size, assembly.fusion_stage(run_config, log), sink)
+    robot = assembly.robot(run_config, assembly.robot_base(run_config, log))
+    moved = assembly.followers(run_config, assembly.programme(run_config, log, robot), int(ticks_ns[0]))
+    some = {name: moved[name] for name in names}
+    for _ in stages.plan_batches(states, assembly.surroundings(run_config, robot), some, math.inf, sink):
+        pass
+    tables.close()
+    return {name: calls for name, calls in sink.watch.calls.items() if name.startswith("plan ")}
 
 
 def _describe_results(

@@ -10,9 +10,11 @@ controller, else with the prediction.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -84,7 +86,9 @@ def _smooth(run_config: RunConfig, log: Log, ticks_ns: Ints) -> Iterator[HumanSt
     yield from smoother.finish()
 
 
-def write_contact(run_config: RunConfig, log: Log, writer: RunWriter, T_world_base: Floats) -> None:
+def write_contact(
+    run_config: RunConfig, log: Log, writer: RunWriter, T_world_base: Floats, second: Executor | None = None
+) -> None:
     """Writes contact.parquet and severity.parquet for every motion of a run, and the recorded body for drawing.
 
     Args:
@@ -92,30 +96,67 @@ def write_contact(run_config: RunConfig, log: Log, writer: RunWriter, T_world_ba
         log: Log of the run.
         writer: Run folder with complete tables.
         T_world_base: (4, 4) robot base in the world.
+        second: A second process, which takes the motions other than the chosen one; None: no such process.
     """
-    robot = assembly.robot(run_config, T_world_base)
     people = read_recorded_people(run_config, log, writer)
-    predicted = Predicted(assembly.prediction_stage(run_config), writer.partial / "state.parquet")
-    chosen = run_config.settings.plan.method
-    for path in sorted(writer.partial.glob("motion*.parquet")):
-        method = path.stem.removeprefix("motion").removeprefix("_") or chosen
-        motion = pq.read_table(path).to_pandas()
-        own = full = None
+    judged = _JudgedRun(run_config, T_world_base, people, writer.partial)
+    paths = sorted(writer.partial.glob("motion*.parquet"))
+    there = {path: second.submit(judged.tables, path) for path in paths[1:] if second is not None}
+    for path in paths:
+        motion, capsules = pq.read_table(path).to_pandas(), None
         if path.stem == "motion":
-            own, full = (
-                compute_own_coverage(run_config, people, predicted, motion),
-                compute_full_coverage(run_config, people, predicted),
-            )
             shown_ns = motion["t_ns"].to_numpy()[:: max(1, round(run_config.settings.fusion.rate_hz / _BODY_HZ))]
             writer.table("body", body_table(people, shown_ns, run_config.settings.prediction.hand_m))
-        capsules = None
-        if method == RECORDED and motion["q1"].isna().all():
+        if path.stem == f"motion_{RECORDED}" and motion["q1"].isna().all():
             capsules, _ = assembly.recorded_capsules(log, T_world_base)
-        rows = contact_table(run_config, robot, method, motion, people, predicted, own, full, capsules)
+        if path in there and capsules is None and not there[path].cancel():
+            rows, meetings = there[path].result()
+        else:
+            rows, meetings = judged.tables(path, capsules)
         writer.table("contact", rows)
-        meetings = arrow_table(rows).to_pandas()
-        writer.table("severity", severity_table(run_config, robot, method, motion, meetings, people, capsules))
+        writer.table("severity", meetings)
     writer.close_tables()
+
+
+@dataclass(frozen=True)
+class _JudgedRun:
+    """A run whose motions are judged; either process makes robot and volumes again."""
+
+    run_config: RunConfig
+    T_world_base: Floats  #: (4, 4) robot base in the world
+    people: RecordedPeople
+    folder: Path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickles what the other process needs to make the rest."""
+        return _JudgedRun, (self.run_config, self.T_world_base, self.people, self.folder)
+
+    @cached_property
+    def robot(self) -> RobotModel:
+        """The robot at its base pose in the world."""
+        return assembly.robot(self.run_config, self.T_world_base)
+
+    @cached_property
+    def predicted(self) -> Predicted:
+        """Volumes of any tick."""
+        return Predicted(assembly.prediction_stage(self.run_config), self.folder / "state.parquet")
+
+    def tables(self, path: Path, capsules: RecordedCapsules | None = None) -> tuple[Columns, Columns]:
+        """Computes the rows of contact and of severity of a motion.
+
+        Args:
+            path: Table of the motion; that of the chosen method is judged by the volumes, too.
+            capsules: The robot as recorded by its capsules; None: no such robot.
+        """
+        run_config, people = self.run_config, self.people
+        method = path.stem.removeprefix("motion").removeprefix("_") or run_config.settings.plan.method
+        motion, own, full = pq.read_table(path).to_pandas(), None, None
+        if path.stem == "motion":
+            own = compute_own_coverage(run_config, people, self.predicted, motion)
+            full = compute_full_coverage(run_config, people, self.predicted)
+        rows = contact_table(run_config, self.robot, method, motion, people, self.predicted, own, full, capsules)
+        meetings = arrow_table(rows).to_pandas()
+        return rows, severity_table(run_config, self.robot, method, motion, meetings, people, capsules)
 
 
 def body_table(people: RecordedPeople, at_ns: Ints, hand_m: float) -> Columns:

@@ -341,6 +341,11 @@ class Stopwatch:
         yield
         self._calls.setdefault(name, []).append((ticks, self._clock_ns() - start))
 
+    @property
+    def calls(self) -> dict[str, list[tuple[int, int]]]:
+        """Stage -> ticks and duration [ns] of each call."""
+        return self._calls
+
     def summary(self, period_s: float) -> dict[str, Any]:
         """Summarises each stage: ticks; median, p99, p99.9 and max time a tick [us]; speed relative to real time."""
         out = {}
