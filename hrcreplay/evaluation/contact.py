@@ -101,6 +101,7 @@ def write_contact(
     people = read_recorded_people(run_config, log, writer)
     judged = _JudgedRun(run_config, T_world_base, people, writer.partial)
     paths = sorted(writer.partial.glob("motion*.parquet"))
+    full = judged.full if second is None else second.submit(judged.full).result
     there = {path: second.submit(judged.tables, path) for path in paths[1:] if second is not None}
     for path in paths:
         motion, capsules = pq.read_table(path).to_pandas(), None
@@ -112,7 +113,7 @@ def write_contact(
         if path in there and capsules is None and not there[path].cancel():
             rows, meetings = there[path].result()
         else:
-            rows, meetings = judged.tables(path, capsules)
+            rows, meetings = judged.tables(path, capsules, full)
         writer.table("contact", rows)
         writer.table("severity", meetings)
     writer.close_tables()
@@ -141,20 +142,27 @@ class _JudgedRun:
         """Volumes of any tick."""
         return Predicted(assembly.prediction_stage(self.run_config), self.folder / "state.parquet")
 
-    def tables(self, path: Path, capsules: RecordedCapsules | None = None) -> tuple[Columns, Columns]:
+    def full(self) -> Coverage:
+        """Coverage by the volumes until the braking time."""
+        return compute_full_coverage(self.run_config, self.people, self.predicted)
+
+    def tables(
+        self, path: Path, capsules: RecordedCapsules | None = None, full: Callable[[], Coverage] | None = None
+    ) -> tuple[Columns, Columns]:
         """Computes the rows of contact and of severity of a motion.
 
         Args:
             path: Table of the motion; that of the chosen method is judged by the volumes, too.
             capsules: The robot as recorded by its capsules; None: no such robot.
+            full: Gives ``full()``, for the chosen method.
         """
         run_config, people = self.run_config, self.people
         method = path.stem.removeprefix("motion").removeprefix("_") or run_config.settings.plan.method
-        motion, own, full = pq.read_table(path).to_pandas(), None, None
+        motion, own, until = pq.read_table(path).to_pandas(), None, None
         if path.stem == "motion":
             own = compute_own_coverage(run_config, people, self.predicted, motion)
-            full = compute_full_coverage(run_config, people, self.predicted)
-        rows = contact_table(run_config, self.robot, method, motion, people, self.predicted, own, full, capsules)
+            until = (full or self.full)()
+        rows = contact_table(run_config, self.robot, method, motion, people, self.predicted, own, until, capsules)
         meetings = arrow_table(rows).to_pandas()
         return rows, severity_table(run_config, self.robot, method, motion, meetings, people, capsules)
 
