@@ -12,6 +12,7 @@ from scipy.linalg import expm
 
 from hrcreplay.human.model import skeleton
 from hrcreplay.records import LIMBS, POINTS, Floats
+from hrcreplay.reporting import replay_scene
 from hrcreplay.reporting.metrics.contact import stop_events
 from hrcreplay.reporting.page.replay_page import MISSING, NumberBlock, replay_data
 from hrcreplay.reporting.replay_scene import SHOWN_POINTS, ReplayScene
@@ -51,6 +52,15 @@ def test_a_scene_has_25_instants_a_second_of_every_table(scene: ReplayScene) -> 
     assert np.isnan(scene.points_m[~known]).all()
     assert np.abs(scene.points_m[known] - want[known]).max() < 0.05  # the fused person is a little off
     np.testing.assert_allclose(scene.body_m[:, 3, 0], skeleton(pose(scene.seconds), np.tile(LENGTHS_M, (200, 1)))[:, 9])
+
+
+def test_a_run_of_more_than_ten_minutes_has_fewer_instants(scene: ReplayScene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(replay_scene, "WHOLE_S", 4.0)  # so that 8 s are as twenty minutes
+    thin = moving_scene(moving_run(8.0))
+    assert thin.t_ns.tolist() == scene.t_ns[::2].tolist()
+    assert (thin.rate_hz, scene.rate_hz) == (12.5, 25.0)
+    np.testing.assert_array_equal(thin.methods["qp"].q, scene.methods["qp"].q[::2])
+    assert json.loads(replay_data(thin)[0])["rate_hz"] == 12.5
 
 
 def test_a_certified_stop_ends_where_it_would(scene: ReplayScene) -> None:
