@@ -62,6 +62,7 @@ def write(results: ResultsFolder, rows: Sequence[SweepRow], settings: Sequence[V
         total([row.figures for row in rows if row.setting == number and row.figures is not None])
         for number in range(len(settings))
     ]
+    front = find_front(rows, totals)
     found = {
         "settings": [dict(values) for values in settings],
         "fields": {field.name: {"unit": field.unit, "meaning": field.meaning} for field in FIELDS},
@@ -70,17 +71,18 @@ def write(results: ResultsFolder, rows: Sequence[SweepRow], settings: Sequence[V
             for row in rows
         ],
         "total": totals,
+        "front": front,
     }
     results.write("sweep.json", run_folder.to_json(found))
     results.write("sweep.csv", as_csv(rows, settings, totals))
     results.write("costs.json", run_folder.to_json({row.folder: row.cost for row in rows if row.cost}))
     with drawing.style():
-        figure = draw_front(rows, totals)
+        figure = draw_front(rows, totals, front)
         svg = drawing.svg_bytes(figure)
         figure.set_facecolor("white")
         results.write("sweep.png", drawing.png_bytes(figure))
     results.write("sweep.svg", svg)
-    results.write("sweep.html", render(rows, settings, totals, svg.decode()))
+    results.write("sweep.html", render(rows, settings, totals, front, svg.decode()))
 
 
 def figures(
@@ -167,26 +169,48 @@ def _point(figures: Mapping[str, Any] | None, name: str, factor: float) -> tuple
     return 100.0 * figures["pace"], factor * figures[name]
 
 
-def draw_front(rows: Sequence[SweepRow], totals: Sequence[Mapping[str, Any]]) -> Figure:
+def find_front(rows: Sequence[SweepRow], totals: Sequence[Mapping[str, Any]], against: int = 0) -> list[int]:
+    """Indices of the settings on the Pareto front of pace and another figure, of those that can be compared.
+
+    Args:
+        rows: All runs.
+        totals: Figures of each setting over all logs.
+        against: 0: distance; 1: coverage.
+    """
+    lacking, (name, factor, _) = _lacking(rows), _against(totals)[against]
+    return select_front([None if n in lacking else _point(total, name, factor) for n, total in enumerate(totals)])
+
+
+def _lacking(rows: Sequence[SweepRow]) -> list[int]:
+    """Indices of the settings that lack a log that others have: it may be the hardest one for all of them."""
+    logs = {row.log for row in rows if row.figures is not None}
+    return sorted({row.setting for row in rows if row.figures is None and row.log in logs})
+
+
+def draw_front(rows: Sequence[SweepRow], totals: Sequence[Mapping[str, Any]], front: Sequence[int]) -> Figure:
     """Draws the pace against distance and against coverage: a number per setting, a dot per run, and the fronts.
 
     Args:
         rows: All runs.
         totals: Figures of each setting over all logs.
+        front: Settings on the front of pace and distance.
     """
     figure = drawing.new_figure(3.6)
     (axes,) = drawing.panels(figure, 1, 2, bottom_in=0.5)
-    for ax, (name, factor, label) in zip(axes, _against(totals), strict=True):
-        _draw_one(
-            ax, [_point(total, name, factor) for total in totals], [_point(r.figures, name, factor) for r in rows]
-        )
+    fronts = front, find_front(rows, totals, 1)
+    for ax, (name, factor, label), best in zip(axes, _against(totals), fronts, strict=True):
+        each = [_point(row.figures, name, factor) for row in rows]
+        _draw_one(ax, [_point(total, name, factor) for total in totals], each, best)
         ax.set(xlabel="pace kept, of the programmed [%]", ylabel=label)
     axes[0].set_title("Settings by number; line: the Pareto front; dots: each run")
     return figure
 
 
 def _draw_one(
-    ax: Axes, totals: Sequence[tuple[float, float] | None], each: Sequence[tuple[float, float] | None]
+    ax: Axes,
+    totals: Sequence[tuple[float, float] | None],
+    each: Sequence[tuple[float, float] | None],
+    front: Sequence[int],
 ) -> None:
     """Draws one panel."""
     dots = [point for point in each if point is not None]
@@ -194,9 +218,8 @@ def _draw_one(
         ax.text(0.5, 0.5, "not known in these runs", ha="center", va="center", transform=ax.transAxes)
         return
     ax.plot(*zip(*dots, strict=True), ".", ms=4, color=drawing.FAINT, alpha=0.5)
-    front = select_front(totals)
-    path = [point for i in front if (point := totals[i]) is not None]
-    ax.plot(*zip(*path, strict=True), "-", lw=1.2, color=drawing.BLUE, drawstyle="steps-pre")
+    path = np.array([point for i in front if (point := totals[i]) is not None]).reshape(-1, 2)
+    ax.plot(*path.T, "-", lw=1.2, color=drawing.BLUE, drawstyle="steps-pre")
     for number, point in enumerate(totals):
         if point is not None:
             colour = drawing.BLUE if number in front else drawing.INK
@@ -204,6 +227,8 @@ def _draw_one(
             ax.annotate(str(number + 1), point, (3, 3), textcoords="offset points", color=colour, fontsize=7.5)
 
 
+#: Maximum number of settings that the answer describes by their values.
+_NAMED = 3
 #: Heading, figure, factor and decimals of the page's columns.
 _COLUMNS = (
     ("pace %", "pace", 100, 1),
@@ -231,7 +256,11 @@ def _cells(figures: Mapping[str, Any] | None) -> tuple[str, ...]:
 
 
 def render(
-    rows: Sequence[SweepRow], settings: Sequence[Values], totals: Sequence[Mapping[str, Any]], picture: str
+    rows: Sequence[SweepRow],
+    settings: Sequence[Values],
+    totals: Sequence[Mapping[str, Any]],
+    front: Sequence[int],
+    picture: str,
 ) -> str:
     """Renders the page of a sweep, with links to the runs.
 
@@ -239,6 +268,7 @@ def render(
         rows: All runs.
         settings: Values of the grid's keys of each setting.
         totals: Figures of each setting over all logs.
+        front: Settings on the front of pace and distance.
         picture: SVG of ``draw_front``.
     """
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
@@ -249,9 +279,9 @@ def render(
     there = [row for row in rows if row.figures is not None]
     return template.render(
         title="Sweep",
-        subtitle=f"{len(logs)} logs, {len(settings)} settings, {len(there)} of {len(rows)} runs",
+        subtitle=f"{_count(len(logs), 'log')}, {_count(len(settings), 'setting')}, {len(there)} of {len(rows)} runs",
         verdict=None,
-        answers=(_answer(totals),),
+        answers=(_answer(rows, settings, totals, front),),
         cards=(
             Card(str(len(there)), "runs", f"of {len(rows)}"),
             Card(str(len(failed)), "failed", "the table has the reasons"),
@@ -268,14 +298,29 @@ def render(
     )
 
 
-def _answer(totals: Sequence[Mapping[str, Any]]) -> Answer:
-    """Names the settings on the Pareto front of pace and distance, and those with contact."""
-    front = select_front([_point(total, *_against(totals)[0][:2]) for total in totals])
-    numbers = ", ".join(str(number + 1) for number in front) or "none known"
-    touched = [str(number + 1) for number, total in enumerate(totals) if total["touch_ticks"]]
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
+
+
+def _answer(
+    rows: Sequence[SweepRow],
+    settings: Sequence[Values],
+    totals: Sequence[Mapping[str, Any]],
+    front: Sequence[int],
+) -> Answer:
+    """Names the settings on the Pareto front of pace and distance, those with contact, and those not compared."""
+
+    def numbers(some: Sequence[int]) -> str:
+        return ", ".join(str(number + 1) for number in some)
+
     words = "Each of these keeps more pace than any setting that stayed further from people, over all logs."
-    words += f"\nThe moving robot touched somebody with the settings {', '.join(touched)}." if touched else ""
-    return Answer("Which settings give the most pace for the distance?", f"Settings {numbers}.", words)
+    touched = [number for number, total in enumerate(totals) if total["touch_ticks"]]
+    words += f"\nThe moving robot touched somebody with the settings {numbers(touched)}." if touched else ""
+    lacking = _lacking(rows)
+    words += f"\nNot compared, as they lack a log that others have: settings {numbers(lacking)}." if lacking else ""
+    named = [f"{number + 1} ({', '.join(f'{k} = {v}' for k, v in settings[number].items())})" for number in front]
+    answer = "; ".join(named[:_NAMED]) + (f"; {numbers(front[_NAMED:])}" if front[_NAMED:] else "")
+    return Answer("Which settings give the most pace for the distance?", f"{answer or 'None is known'}.", words)
 
 
 def _parts(
@@ -296,10 +341,11 @@ def _parts(
     return (
         PageSection(
             "settings-compared",
-            "Settings",
+            "Settings compared",
             "All logs together: sums of ticks and times, and the worst extremes.",
             (PageFigure("sweep", caption, svg),),
             (PageTable("Settings", ("number", *keys, *heads), total_rows),),
+            unfolded=True,
         ),
         PageSection(
             "runs",

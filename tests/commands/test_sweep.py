@@ -21,7 +21,8 @@ import pytest
 from hrcreplay.commands import replay, sweep
 from hrcreplay.commands.sweep_worker import FAILED, FUSED, RUNS
 from hrcreplay.errors import EXIT_INTERRUPTED, LogError, SettingsError
-from hrcreplay.reporting.sweep_report import select_front
+from hrcreplay.reporting import sweep_report
+from hrcreplay.reporting.sweep_report import SweepRow, select_front
 from hrcreplay.store.results import WORK
 
 SPAN: Any = {"start_s": 8.0, "end_s": 12.0}
@@ -77,6 +78,31 @@ def test_the_front_holds_what_nothing_beats() -> None:
     for i, point in enumerate(points):
         beaten = any((other >= point).all() and (other > point).any() for other in points)
         assert (i + 1 in front) is not beaten
+
+
+def test_a_setting_that_lacks_the_hardest_log_is_not_on_the_front() -> None:
+    paces = {"easy": (0.9, 0.5), "hard": (0.2, 0.4)}
+    for missing, best in ((None, [1, 0]), (("hard", 0), [1]), (("broken", None), [1, 0])):
+        rows = []
+        for log, pace in {**paces, "broken": (None, None)}.items():
+            for setting in (0, 1):
+                lacks = log == "broken" or missing == (log, setting)
+                given = {**dict.fromkeys(field.name for field in sweep_report.FIELDS), "touch_ticks": 0}
+                given |= {"pace": pace[setting], "nearest_moving_m": 0.1 + 0.1 * setting}
+                rows.append(SweepRow(log, setting, f"{log}/{setting}", None if lacks else given, None, "bad" * lacks))
+        totals = [  # as means over the logs that are there
+            {
+                **dict.fromkeys(field.name for field in sweep_report.FIELDS),
+                "touch_ticks": 0,
+                "pace": float(np.mean([row.figures["pace"] for row in rows if row.setting == n and row.figures])),
+                "nearest_moving_m": 0.1 + 0.1 * n,
+            }
+            for n in (0, 1)
+        ]
+        front = sweep_report.find_front(rows, totals)
+        assert front == best
+        page = sweep_report.render(rows, [{"plan.method": "qp"}, {"plan.method": "ssm"}], totals, front, "<svg></svg>")
+        assert ("lack a log" in page) == (missing == ("hard", 0))
 
 
 @pytest.fixture(scope="module")

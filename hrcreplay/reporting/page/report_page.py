@@ -63,6 +63,7 @@ class PageSection:
     figures: tuple[PageFigure, ...] = ()
     tables: tuple[PageTable, ...] = ()
     missing: str = ""
+    unfolded: bool = False
 
 
 def render(
