@@ -263,6 +263,9 @@ class HumanStates(Table):
     frame_age_s: Floats  #: (n,) time since the capture of the newest frame in the filter [s]; inf before the first
     points_m: Floats  #: (n, 20, 3) recent POINTS that cameras show away from the model, world [m]; otherwise NaN
     cameras: tuple[str, ...]
+    #: (n, c, 20, 3) recent POINTS as each camera shows them, world [m]; while the torso is seen only those away from
+    #: ``points_m``, otherwise NaN. None: not known
+    camera_points_m: Floats | None = None
     nobody_s: Floats | None = None  #: (n,) time since the watched area was last empty [s]; None: no watched area
     nobody_else_s: Floats | None = None  #: (n,) the same, apart from the people tracked [s]; inf before the first time
     person: Ints | None = None  #: (n,) number of the person, from 1; None: person 1 in all rows, one row per tick

@@ -1,18 +1,19 @@
 """The fit of ``human.model.Departure`` to the departures of whole limbs from constant velocity on recordings.
 
 First rise and sink are fitted by a quantile, as the whole body moves with the pelvis. Then quantile regression gives
-each pair of limbs and horizon a line over the limb's residual: the lowest line above the required share of the
-departures. The lines are then raised by one factor per horizon, until whole people, not single limbs, are inside in the
-required share of the ticks of every log. Last, people with ground truth are included almost completely, by raising the
-lines that cost the least volume, as their misses are not camera errors. Simulated people, with an unlimited number of
-ticks, do not count in totals over the ticks of all logs.
+each pair of limbs and horizon a multiple of the residual, which is where the limb is now, and where it can go from
+there: an offset, and a slope over its present speed. The lines lie above the required share of the departures. Then
+those that cost the least volume are raised, until whole people, not single limbs, are inside in the required share of
+the ticks of every log and of all together; of those with ground truth almost completely, as their misses are not camera
+errors. Simulated people, with an unlimited number of ticks, do not count in totals over the ticks of all logs. Last,
+people whom no fit has seen depart further than those of the fit: by one factor per horizon all lines are widened to
+what the people of each group need on lines that were fitted without them (``others_need``).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import compress
 
 import numpy as np
 from scipy.optimize import linprog
@@ -21,19 +22,26 @@ from scipy.sparse import coo_array, eye_array, hstack
 from hrcreplay.audit.departures import EXACT, LimbDepartures
 from hrcreplay.human.model import Departure
 from hrcreplay.human.prediction.velocity_tube import NOISE_M
-from hrcreplay.records import BODY, Floats
+from hrcreplay.records import BODY, Bools, Floats
 
 #: Limbs that share a line: both sides of the body.
 _PAIRS = ((0,), (1,), (2, 4), (3, 5), (6,))
 #: Share of a pair's departures below its line before the line is raised.
-_BELOW = 0.995
-#: Maximum slope of a line; a larger slope comes from the few logs with much noise.
-_STEEPEST = 1.25
-#: Maximum common factor of all lines, number of bisection steps, and maximum factor of one line after that.
-_MOST, _HALVINGS, _MOST_AGAIN = 1.5, 12, 1.5
+_BELOW = 0.99
+#: Share of all rises and sinks of the pelvis below theirs.
+_RISEN = 0.995
+#: Maximum multiple of the residual; a larger one comes from the few logs with much noise.
+_STEEPEST = 1.0
+#: Maximum slope over the speed: the time for which a limb's tube does not carry it, and for the filter's lag [s].
+_SWINGS_S = 0.3
+#: Maximum factor on a line, and that for logs with ground truth; a larger one comes from the few ticks at which a
+#: tracker throws a limb.
+_MOST, _MOST_TRUE = 1.4, 2.25
+#: Least and maximum factor for people who were not in the fit, and the step in which it is found.
+_LEAST_OTHERS, _MOST_OTHERS, _STEP = 1.05, 1.5, 0.01
 #: Factors on the requested share of misses: for a log that was left out; in the fit, for each log, for each log with
-#: ground truth, and for all logs together. The last is below 1, as people outside the fit have more misses.
-EACH, _FITTED, _TRUE, _TOGETHER = 3.0, 2.25, 0.3, 0.6
+#: ground truth, and for all logs together; and for people outside the fit, who choose how far lines are widened.
+EACH, _FITTED, _TRUE, _TOGETHER, _OTHERS = 3.0, 2.25, 0.3, 1.2, 0.95
 #: Departures, their slopes, and rise and sink are rounded up to multiples of these [m], [1], [m]. With steps this
 #: coarse most folds have the same rise and sink, so that departures are measured only once.
 _MM, _HUNDREDTH, _CM = 1e-3, 1e-2, 1e-2
@@ -45,25 +53,58 @@ def fit(samples: Sequence[LimbDepartures], share: float) -> Departure:
     Args:
         samples: One per log, with the same horizons.
         share: Required share of the ticks of other logs at each horizon, in (0, 1). Allowed misses in the fit, relative
-            to its complement: 0.6 times over all ticks, 2.25 times in one log, 0.3 times in one with ground truth.
+            to its complement: 1.2 times over all ticks, 2.25 times in one log, 0.3 times in one with ground truth.
     """
     horizon_s = samples[0].horizon_s
     rise_m, sink_m = (_rise(horizon_s, [s.height_m[way] for s in samples]) for way in range(2))
-    lines = np.zeros((len(BODY), len(horizon_s), 2))
-    for k in range(len(horizon_s)):
-        beyond = [s.beyond_m(k, float(rise_m[k]), float(sink_m[k])) for s in samples]
-        for pair in _PAIRS:
-            logs = zip(beyond, samples, strict=True)
-            lines[list(pair), k] = _line([(b[:, pair], np.minimum(s.residual_m[:, pair], NOISE_M)) for b, s in logs])
-    plain = Departure(horizon_s, _up(lines[..., 0], _MM), _up(lines[..., 1], _HUNDREDTH), rise_m, sink_m)
-    recorded = list(compress(samples, counted(samples)))
-    common = np.array([_factor(recorded, plain, k, share) for k in range(len(horizon_s))])
-    raised = _times(plain, common)
-    true = [s for s in samples if s.true]
-    if true:
-        raised = _times(raised, np.column_stack([_raise(true, raised, k, share) for k in range(len(horizon_s))]))
-    beyond_m, residuals = _up(raised.beyond_m, _MM), _up(raised.residuals, _HUNDREDTH)
-    return replace(raised, beyond_m=beyond_m, residuals=residuals)
+    plain = _lines(samples, horizon_s, rise_m, sink_m)
+    factors = [_raise(samples, plain, k, share) for k in range(len(horizon_s))]
+    return _rounded(_times(plain, np.column_stack(factors)))
+
+
+def _lines(samples: Sequence[LimbDepartures], horizon_s: Floats, rise_m: Floats, sink_m: Floats) -> Departure:
+    """Fits the lines, from the longest horizon down to the shortest, so that none is above that of a longer one."""
+    now, goes, swings_s = np.zeros((3, len(BODY), len(horizon_s)))
+    for pair in map(list, _PAIRS):
+        residual = [np.minimum(s.residual_m[:, pair], NOISE_M) for s in samples]
+        speed, most = [s.speed_m_per_s[:, pair] for s in samples], (np.inf, _STEEPEST, _SWINGS_S)
+        for k in reversed(range(len(horizon_s))):
+            beyond = [s.beyond_m(k, float(rise_m[k]), float(sink_m[k]))[:, pair] for s in samples]
+            offset, times, slope = _line(beyond, [residual, speed], most).tolist()
+            goes[pair, k], now[pair, k], swings_s[pair, k] = offset, times, slope
+            most = (offset, _STEEPEST, slope)
+    return _rounded(Departure(horizon_s, goes, now, rise_m, sink_m, swings_s))
+
+
+def _rounded(departure: Departure) -> Departure:
+    beyond_m, swings_s = (_up(of, _MM) for of in (departure.beyond_m, _swings(departure)))
+    return replace(departure, beyond_m=beyond_m, residuals=_up(departure.residuals, _HUNDREDTH), swings_s=swings_s)
+
+
+def _swings(departure: Departure) -> Floats:
+    return np.zeros_like(departure.beyond_m) if departure.swings_s is None else departure.swings_s
+
+
+def widen(departure: Departure, factors: Floats) -> Departure:
+    """Returns the departures with the lines of each horizon raised by one of the factors (h,)."""
+    return _rounded(_times(departure, factors))
+
+
+def others_need(samples: Sequence[LimbDepartures], folds: Sequence[Departure], share: float) -> Floats:
+    """(h,) factors on lines that were fitted to other people, above which enough of these people stay inside.
+
+    Args:
+        samples: One per log.
+        folds: For each log, the departures fitted without its person and tracker.
+        share: Required share of the ticks of all logs together at each horizon.
+    """
+    pooled = [pair for pair, counts in zip(zip(samples, folds, strict=True), counted(samples), strict=True) if counts]
+    found = np.ones(len(folds[0].horizon_s))
+    for k in range(len(found)):
+        needed = np.concatenate([_needed([one], fold, k)[0].max(axis=1) for one, fold in pooled])
+        if len(needed):
+            found[k] = np.quantile(needed, 1.0 - _OTHERS * (1.0 - share), method="higher")
+    return np.clip(_up(found, _STEP), _LEAST_OTHERS, _MOST_OTHERS)
 
 
 def counted(samples: Sequence[LimbDepartures]) -> list[bool]:
@@ -74,7 +115,10 @@ def counted(samples: Sequence[LimbDepartures]) -> list[bool]:
 
 def _times(departure: Departure, factor: Floats) -> Departure:
     """Returns the lines raised by factors that broadcast to (7, h)."""
-    return replace(departure, beyond_m=factor * departure.beyond_m, residuals=factor * departure.residuals)
+    beyond_m, residuals, swings_s = (
+        factor * of for of in (departure.beyond_m, departure.residuals, _swings(departure))
+    )
+    return replace(departure, beyond_m=beyond_m, residuals=residuals, swings_s=swings_s)
 
 
 def _rise(horizon_s: Floats, logs: Sequence[Floats]) -> Floats:
@@ -89,7 +133,7 @@ def _rise(horizon_s: Floats, logs: Sequence[Floats]) -> Floats:
 
 
 def _often(logs: Sequence[Floats]) -> float:
-    """Returns the quantile _BELOW of all heights [m]; a log's weight is the root of its number of ticks."""
+    """Returns the quantile _RISEN of all heights [m]; a log's weight is the root of its number of ticks."""
     known = [log[np.isfinite(log)] for log in logs]
     height = np.concatenate(known)
     if not len(height):
@@ -97,64 +141,36 @@ def _often(logs: Sequence[Floats]) -> float:
     weight = np.concatenate([np.full(len(log), max(1, len(log)) ** -0.5) for log in known])
     order = np.argsort(height, kind="stable")
     below = np.cumsum(weight[order])
-    return float(height[order][np.searchsorted(below, _BELOW * below[-1])])
+    return float(height[order][np.searchsorted(below, _RISEN * below[-1])])
 
 
-def _line(logs: Sequence[tuple[Floats, Floats]]) -> Floats:
-    """(2,) offset >= 0 and slope, up to _STEEPEST, of the line with the minimum quantile loss.
+def _line(departed: Sequence[Floats], over: Sequence[Sequence[Floats]], most: Sequence[float]) -> Floats:
+    """Offset >= 0 and a slope over each of some quantities: the plane with the minimum quantile loss.
 
     The weight of a log is the root of its number of ticks.
+
+    Args:
+        departed: Departures of each log, NaN if unknown [m].
+        over: The quantities at the same places, of each log.
+        most: Maximum offset, and slope over each.
     """
-    far, near, weight = [], [], []
-    for beyond, residual in logs:
-        known = np.isfinite(beyond)
-        far.append(beyond[known])
-        near.append(residual[known])
-        weight.append(np.full(known.sum(), max(1, known.sum()) ** -0.5))
-    y, x, w = np.concatenate(far), np.concatenate(near), np.concatenate(weight)
+    known = [np.isfinite(of) for of in departed]
+    y = np.concatenate([of[k] for of, k in zip(departed, known, strict=True)])
     if not len(y):
-        return np.array([0.0, 1.0])
-    n, w = len(y), w / w.mean()
-    unknowns = coo_array(np.column_stack([np.ones(n), x]))
+        return np.zeros(len(most))
+    n, w = len(y), np.concatenate([np.full(k.sum(), max(1, k.sum()) ** -0.5) for k in known])
+    w = w / w.mean()
+    each = [np.concatenate([of[k] for of, k in zip(one, known, strict=True)]) for one in over]
+    unknowns = coo_array(np.column_stack([np.ones(n), *each]))
     found = linprog(
-        np.concatenate([[0.0, 0.0], _BELOW * w, (1.0 - _BELOW) * w]),
+        np.concatenate([np.zeros(len(most)), _BELOW * w, (1.0 - _BELOW) * w]),
         A_eq=hstack([unknowns, eye_array(n), -eye_array(n)]).tocsr(),
         b_eq=y,
-        bounds=[(0.0, None), (0.0, _STEEPEST)] + [(0.0, None)] * (2 * n),
+        bounds=[(0.0, None if limit == np.inf else limit) for limit in most] + [(0.0, None)] * (2 * n),
         method="highs",
     )
-    line: Floats = found.x[:2]
+    line: Floats = found.x[: len(most)]
     return line
-
-
-def _factor(samples: Sequence[LimbDepartures], plain: Departure, k: int, share: float) -> float:
-    """Returns the smallest factor on the lines at a horizon that contains the people of all logs together and of each.
-
-    A log whose people exceed even the largest factor, as with a camera that loses the legs, is ignored.
-    """
-    needed = [of.max(axis=1) for of in _needed(samples, plain, k)]
-    if not any(len(of) for of in needed):
-        return 1.0
-    least = 1.0 - _FITTED * (1.0 - share)
-
-    def shares(factor: float) -> tuple[Floats, float]:
-        hits = [of <= factor + EXACT for of in needed]
-        return np.array([hit.mean() if len(hit) else 1.0 for hit in hits]), float(np.concatenate(hits).mean())
-
-    each, together = shares(_MOST)
-    asks, wanted = each >= least, min(1.0 - _TOGETHER * (1.0 - share), together)
-
-    def enough(factor: float) -> bool:
-        each, together = shares(factor)
-        return bool((each[asks] >= least).all() and together >= wanted)
-
-    low, high = 1.0, _MOST
-    if enough(low):
-        return low
-    for _ in range(_HALVINGS):
-        middle = 0.5 * (low + high)
-        low, high = (low, middle) if enough(middle) else (middle, high)
-    return high
 
 
 def _needed(samples: Sequence[LimbDepartures], departure: Departure, k: int) -> list[Floats]:
@@ -164,20 +180,29 @@ def _needed(samples: Sequence[LimbDepartures], departure: Departure, k: int) -> 
 
 
 def _raise(samples: Sequence[LimbDepartures], departure: Departure, k: int, share: float) -> Floats:
-    """(7,) factors on the lines at a horizon that contain the people of each of the logs with ground truth.
+    """(7,) factors on the lines at a horizon that contain the people of each log and of all recordings together.
 
     The limbs of a pair share a factor. The ticks outside are included one after the other, the one that costs the least
-    volume first, until enough are inside or only ticks beyond the largest factors remain.
+    volume first, until enough are inside or only ticks beyond the largest factor remain: those of a tracker that throws
+    a limb away.
     """
     needed = _needed(samples, departure, k)
     log = np.repeat(np.arange(len(samples)), [len(of) for of in needed])
     pairs = np.column_stack([np.concatenate(needed)[:, list(pair)].max(axis=1) for pair in _PAIRS])
-    wanted = (1.0 - _TRUE * (1.0 - share)) * np.bincount(log, minlength=len(samples))
+    true, pooled = np.array([sample.true for sample in samples]), np.array(counted(samples))[log]
+    wanted = (1.0 - np.where(true, _TRUE, _FITTED) * (1.0 - share)) * np.bincount(log, minlength=len(samples))
+    together = (1.0 - _TOGETHER * (1.0 - share)) * pooled.sum()
     weight, found = _weights(samples, departure, k), np.ones(len(_PAIRS))
+    most = np.array([_MOST_TRUE if sample.true else _MOST for sample in samples])
+    possible: Bools = np.asarray((pairs <= most[log][:, None]).all(axis=1))
+    asks = np.bincount(log[possible], minlength=len(samples)) >= wanted - EXACT
     while True:
-        held = (pairs <= found + EXACT).all(axis=1)
-        short = np.bincount(log[held], minlength=len(samples)) < wanted - EXACT
-        outside = pairs[(pairs <= _MOST_AGAIN).all(axis=1) & ~held & short[log]]
+        held: Bools = np.asarray((pairs <= found + EXACT).all(axis=1))
+        lacks = asks & (np.bincount(log[held], minlength=len(samples)) < wanted - EXACT)
+        asked = possible & ~held
+        outside = pairs[asked & lacks[log]]
+        if not len(outside) and held[pooled].sum() < together - EXACT:
+            outside = pairs[asked & pooled]
         if not len(outside):
             break
         raised = np.maximum(outside, found)
@@ -191,7 +216,9 @@ def _raise(samples: Sequence[LimbDepartures], departure: Departure, k: int, shar
 def _weights(samples: Sequence[LimbDepartures], departure: Departure, k: int) -> Floats:
     """(pairs,) costs of the tubes of a pair: their cross-sections, which grow with the square of the radius."""
     noise = np.minimum(np.concatenate([s.residual_m for s in samples]), NOISE_M)
+    speed = np.concatenate([s.speed_m_per_s for s in samples])
     radius_m = departure.beyond_m[:, k] + departure.residuals[:, k] * noise.mean(axis=0)
+    radius_m = radius_m + _swings(departure)[:, k] * speed.mean(axis=0)
     return np.array([(radius_m[list(pair)] ** 2).sum() for pair in _PAIRS])
 
 

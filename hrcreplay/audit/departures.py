@@ -20,9 +20,9 @@ from hrcreplay.evaluation.recorded_person import TRUTH, Recording
 from hrcreplay.geometry.inflated_hull import InflatedHull, union_volume_m3
 from hrcreplay.human.model import Departure
 from hrcreplay.human.prediction.swept_volumes import limb_radii
-from hrcreplay.human.prediction.velocity_tube import LEGS, NOISE_M, THORAX, tubes
+from hrcreplay.human.prediction.velocity_tube import LEGS, NOISE_M, THORAX, limb_speeds, tubes
 from hrcreplay.pipeline.assembly import PredictionStage
-from hrcreplay.records import BODY, Bools, Floats, HumanStates, Ints, SweptVolumes
+from hrcreplay.records import BODY, LIMBS, Bools, Floats, HumanStates, Ints, SweptVolumes
 
 #: Measured horizons; robots near people stop within about 10 to 100 ms, and below the first horizon nothing is known
 #: [s].
@@ -42,6 +42,8 @@ class LimbDepartures:
     #: [m]; NaN if a limb was not recorded near the horizon's end, or not seen recently.
     beyond_m: Callable[[int, float, float], Floats]
     residual_m: Floats  #: (n, 7)
+    speed_m_per_s: Floats  #: (n, 7) of ``limb_speeds``
+    settled: Bools  #: (n,) True: the filter has known the person for long enough to know all residuals
     true: bool  #: True: the log contains the ground truth
 
     def rows(self, which: Ints) -> LimbDepartures:
@@ -52,6 +54,8 @@ class LimbDepartures:
             height_m=self.height_m[..., which],
             beyond_m=lambda k, rise_m, sink_m: self.beyond_m(k, rise_m, sink_m)[which],
             residual_m=self.residual_m[which],
+            speed_m_per_s=self.speed_m_per_s[which],
+            settled=self.settled[which],
         )
 
     def inside(self, departure: Departure, k: int) -> Floats:
@@ -71,6 +75,8 @@ class LimbDepartures:
         beyond = self.beyond_m(k, float(departure.rise_m[k]), float(departure.sink_m[k]))
         noise = np.minimum(self.residual_m, NOISE_M)
         line = departure.beyond_m[:, k] + departure.residuals[:, k] * noise
+        if departure.swings_s is not None:
+            line += departure.swings_s[:, k] * self.speed_m_per_s
         needed = (beyond - (self.residual_m - noise)) / np.maximum(line, EXACT)
         return np.where(beyond <= self.residual_m, 0.0, needed)
 
@@ -106,6 +112,8 @@ def departures(stage: PredictionStage, recording: Recording, ticks: Ints) -> Lim
         np.where(asked[:, THORAX], np.stack(heights, axis=1), np.nan),
         beyond_m,
         tubed.residual,
+        limb_speeds(states),
+        np.asarray(np.isfinite(states.residual_m[:, : len(LIMBS)]).all(axis=1)),
         recording.source == TRUTH,
     )
 

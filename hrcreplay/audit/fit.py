@@ -15,14 +15,15 @@ from typing import Any, NamedTuple, Unpack
 import numpy as np
 
 from hrcreplay.audit import COVER, COVERAGE, HELD_BACK, fit_limits
-from hrcreplay.audit.departure_fit import EACH, counted
+from hrcreplay.audit.departure_fit import EACH, counted, others_need, widen
 from hrcreplay.audit.departure_fit import fit as fit_departures
-from hrcreplay.audit.departures import LimbDepartures, capsules_m3, departures, find_unrecorded_limbs, union_m3
+from hrcreplay.audit.departures import EXACT, LimbDepartures, capsules_m3, departures, find_unrecorded_limbs, union_m3
 from hrcreplay.audit.fit_limits import Fit, Futures
 from hrcreplay.audit.measures import Estimate, block_ticks, resample
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.evaluation.recorded_person import SMOOTHED, TRUTH, Recording, read_recording
 from hrcreplay.human.model import Departure, LimitSet
+from hrcreplay.human.prediction.velocity_tube import FASTEST_M_PER_S
 from hrcreplay.limits import load_limits, write_limits
 from hrcreplay.logs.reader import open_log
 from hrcreplay.pipeline import assembly
@@ -31,7 +32,7 @@ from hrcreplay.pipeline.kernel_build import ensure_compiled
 from hrcreplay.pipeline.progress import ProgressBar
 from hrcreplay.pipeline.run_config import RunConfig, RunOptions, resolve
 from hrcreplay.pipeline.stages import NS, span_ns, tick_times
-from hrcreplay.records import JOINTS, LIMBS, Floats
+from hrcreplay.records import BODY, JOINTS, Floats
 from hrcreplay.reporting.tables import share_text
 from hrcreplay.version import __version__
 
@@ -87,6 +88,7 @@ def _departure_lines(found: dict[str, Any]) -> list[str]:
         sizes, best = (", ".join(f"{size:.1f}" for size in log[name]) for name in ("union_m3", "fitted_to_it_m3"))
         held = f"{log['name']}: {found['unknown_are']}: {_by_horizon(found, log['shares'])}"
         told.append(f"{held}; union {sizes} m3, fitted to it alone {best} m3")
+    told += [f"{group['name']}: {_by_horizon(found, group['shares'])}" for group in found["groups"]]
     training, unknown = (_by_horizon(found, found[part]) for part in ("training", "unknown"))
     return [*told, f"whole limbs, {found['pooled_are']}: training {training}; {found['unknown_are']} {unknown}"]
 
@@ -138,12 +140,15 @@ def run(
     coverage: float = COVERAGE,
     held_back: float = HELD_BACK,
     cover: str = COVER,
+    groups: Sequence[str] | None = None,
+    checked: Sequence[str] = (),
     **options: Unpack[RunOptions],
 ) -> FitReport:
     """Fits velocity and acceleration bounds to logs and writes them as a limit set.
 
     The last part of every log is held back from the fit. With several logs, each is also left out once as a whole, to
-    measure the coverage of its person by bounds fitted to the others.
+    measure the coverage of its person by bounds fitted to the others. For the departures of limbs, all logs of a group
+    are left out together.
 
     Args:
         logs: Logs, or run folders whose logs, settings and cells are taken.
@@ -152,6 +157,8 @@ def run(
         held_back: Share of every log's time that is held back, at its end.
         cover: ``joints``: bounds on the joints, whose intervals of Alg. 1 cover that share. ``limbs``: also bounds on
             the departure of whole limbs, including the lower body, from constant velocity in that share of the ticks.
+        groups: Name of the tracker and person of each log; None: every log has its own.
+        checked: Groups that are not fitted; with ``limbs`` their coverage is measured.
         **options: Settings, cell and span, as ``run_config.resolve`` takes them.
 
     Returns:
@@ -166,12 +173,14 @@ def run(
     run_configs = [resolve("fit-limits", log, **options) for log in logs]
     horizon_s = _horizon_s(run_configs)
     samples = [_sample(run_config, horizon_s, held_back, cover == "limbs") for run_config in run_configs]
-    found = _fit(samples, coverage, horizon_s)
-    limits = _limits(found, samples, out.stem)
-    facts = _facts(samples, found, limits, coverage, horizon_s, held_back) | {"covers": cover}
+    names = [sample.name for sample in samples] if groups is None else groups
+    fitted = [sample for sample, name in zip(samples, names, strict=True) if name not in checked]
+    found = _fit(fitted, coverage, horizon_s)
+    limits = _limits(found, fitted, out.stem)
+    facts = _facts(fitted, found, limits, coverage, horizon_s, held_back) | {"covers": cover}
     missed = ""
     if cover == "limbs":
-        departure, facts["departures"], missed = _departures(samples, coverage)
+        departure, facts["departures"], missed = _departures(samples, coverage, names, checked)
         limits = replace(limits, departure=departure)
     write_limits(limits, facts, out)
     return FitReport(lines(found, limits, facts, STANDARD), missed)
@@ -244,7 +253,8 @@ def _limbs(run_config: RunConfig, recording: Recording, wanted: bool) -> LimbDep
     stage, states = assembly.prediction_stage(run_config), recording.states
     horizon_ns = round(stage.horizon_s * NS)
     ticks = np.arange(0, len(states), max(1, round(run_config.settings.fusion.rate_hz / DEPARTURES_HZ)))
-    ticks = ticks[np.isfinite(states.residual_m[ticks, : len(LIMBS)]).all(axis=1)]  # the filter has found the person
+    known = np.isfinite(states.p[ticks]).all(axis=1)
+    ticks = ticks[known & (states.frame_age_s[ticks] <= run_config.settings.fusion.fresh_s)]
     ticks = ticks[states.t_ns[ticks] + horizon_ns <= recording.t_ns[-1]] if wanted else ticks[:0]
     return departures(stage, recording, ticks)
 
@@ -256,15 +266,25 @@ def _parts(sample: FitSample) -> tuple[LimbDepartures, LimbDepartures]:
     return whole.rows(np.flatnonzero(first)), whole.rows(np.flatnonzero(t_ns > sample.cut_ns))
 
 
-def _departures(samples: Sequence[FitSample], coverage: float) -> tuple[Departure, dict[str, Any], str]:
-    """Returns the departures fitted to all logs, the coverage by them and by leave-one-out fits, and the misses."""
-    if len(samples) > 1:
-        fitted = known = [sample.limbs for sample in samples]
-        folds = [fit_departures([*known[:i], *known[i + 1 :]], coverage) for i in range(len(known))]
+def _departures(
+    samples: Sequence[FitSample], coverage: float, groups: Sequence[str], checked: Sequence[str]
+) -> tuple[Departure, dict[str, Any], str]:
+    """Returns the departures fitted to all logs, the coverage by them and by fits without a group, and the misses."""
+    apart = len(set(groups) - set(checked)) > 1
+    if apart:
+        known = [sample.limbs for sample in samples]
+        named = [(name, _settled(of)) for name, of in zip(groups, known, strict=True) if name not in checked]
+        fitted = [of for _, of in named]
+        others = {name: [of for own, of in named if own != name] for name in groups}
+        each = {name: fit_departures(rest, coverage) for name, rest in others.items()}
+        left_out = [(own, of, each[own]) for own, of in zip(groups, known, strict=True) if own not in checked]
+        factors = _factors(left_out, None, coverage)
+        folds = [widen(each[name], _factors(left_out, name, coverage)) for name in groups]
     else:
-        fitted, known = ([part] for part in _parts(samples[0]))
-        folds = [fit_departures(fitted, coverage)]
-    found = fit_departures(fitted, coverage)
+        parts = [_parts(sample) for sample in samples]
+        fitted, known = [_settled(first) for first, _ in parts], [last for _, last in parts]
+        folds, factors = [fit_departures(fitted, coverage)] * len(known), np.ones(1)
+    found = widen(fit_departures(fitted, coverage), factors)
     horizons = range(len(found.horizon_s))
     inside = [[one.inside(fold, k) for k in horizons] for one, fold in zip(known, folds, strict=True)]
     recorded = counted(known)
@@ -272,29 +292,96 @@ def _departures(samples: Sequence[FitSample], coverage: float) -> tuple[Departur
     def shares(hits: Sequence[Floats], k: int) -> dict[str, Any]:
         return _plain(_share([of[:, None] for of in hits], found.horizon_s[k], DEPARTURES_HZ))
 
-    logs = [
+    logs: list[dict[str, Any]] = [
         {
             "name": sample.name,
+            "group": group,
             "shares": [shares([hits[k]], k) for k in horizons],
             **_sizes(sample.prediction_stage, one, fold, coverage),
+            "misses": _misses(one, fold, hits, coverage),
         }
-        for sample, one, fold, hits in zip(samples, known, folds, inside, strict=True)
+        for sample, group, one, fold, hits in zip(samples, groups, known, folds, inside, strict=True)
     ]
 
-    def pooled(every: Sequence[Sequence[Floats]]) -> list[dict[str, Any]]:
-        return [shares(list(compress((hits[k] for hits in every), recorded)), k) for k in horizons]
+    def pooled(every: Sequence[Sequence[Floats]], which: Sequence[bool]) -> list[dict[str, Any]]:
+        return [shares(list(compress((hits[k] for hits in every), which)), k) for k in horizons]
 
     facts = {
         "horizon_s": found.horizon_s.tolist(),
         "ticks_hz": DEPARTURES_HZ,
-        "unknown_are": "each log left out once" if len(samples) > 1 else "the part held back",
+        "widened": factors.tolist(),
+        "unknown_are": "each tracker and person left out once" if apart else "the part held back",
         "pooled_are": "all logs" if all(recorded) else "logs without the truth",
-        "training": pooled([[one.inside(found, k) for k in horizons] for one in fitted]),
-        "unknown": pooled(inside),
+        "training": pooled([[one.inside(found, k) for k in horizons] for one in fitted], counted(fitted)),
+        "not_fitted": list(checked),
+        "unknown": pooled(inside, recorded),
+        "groups": [
+            {
+                "name": name,
+                "shares": pooled(inside, [own == name for own in groups]),
+                "union_m3": np.mean([log["union_m3"] for log in logs if log["group"] == name], axis=0)
+                .round(3)
+                .tolist(),
+            }
+            for name in dict.fromkeys(groups)
+        ],
+        "of_recordings": _of_recordings(fitted, found, coverage),
         "not_checked": find_unrecorded_limbs(known),
         "logs": logs,
     }
     return found, facts, _missed(facts, coverage)
+
+
+def _factors(left_out: Sequence[tuple[str, LimbDepartures, Departure]], group: str | None, coverage: float) -> Floats:
+    """Returns the factors that people of other groups than one need on lines fitted without them."""
+    others = [(of, fold) for name, of, fold in left_out if name != group]
+    return others_need([of for of, _ in others], [fold for _, fold in others], coverage)
+
+
+def _settled(of: LimbDepartures) -> LimbDepartures:
+    """Returns the ticks for the fit: later than a person's first second, which the unknown residual bounds."""
+    return of.rows(np.flatnonzero(of.settled))
+
+
+def _of_recordings(fitted: Sequence[LimbDepartures], found: Departure, coverage: float) -> dict[str, Any]:
+    """Returns the share of the bounds, for a limb at rest and at full speed, that logs without ground truth alone give.
+
+    The rest comes from simulated people. Empty if all logs are of one kind.
+    """
+    recorded = [of for of in fitted if not of.true]
+    if len(recorded) in (0, len(fitted)):
+        return {}
+    alone = fit_departures(recorded, coverage)
+
+    def reached_m(departure: Departure, speed_m_per_s: float) -> Floats:
+        swings = 0.0 if departure.swings_s is None else departure.swings_s
+        return np.asarray(departure.beyond_m + speed_m_per_s * swings)
+
+    def parts(speed_m_per_s: float) -> dict[str, list[float]]:
+        share = reached_m(alone, speed_m_per_s) / np.maximum(reached_m(found, speed_m_per_s), EXACT)
+        return {limb: np.round(np.minimum(share[k], 1.0), 2).tolist() for k, limb in enumerate(BODY)}
+
+    return {"at_rest": parts(0.0), "at_full_speed": parts(FASTEST_M_PER_S)}
+
+
+def _misses(one: LimbDepartures, fold: Departure, hits: Sequence[Floats], coverage: float) -> list[dict[str, Any]]:
+    """Returns the limbs that left at the horizons at which a recording stays under its share, tick by tick.
+
+    Of each: time since the log's first tick, horizon [s], distance from where its velocity takes it [m], and that
+    distance over the horizon [m/s]: the speed, beside its own, at which people move or a tracker throws a limb.
+    """
+    found = []
+    for k, held in enumerate(hits):
+        if one.true or (held == 0.0).sum() <= EACH * (1.0 - coverage) * np.isfinite(held).sum():
+            continue
+        horizon_s = float(fold.horizon_s[k])
+        departed = one.beyond_m(k, float(fold.rise_m[k]), float(fold.sink_m[k]))
+        for tick, limb in np.argwhere(one.factors(fold, k) > 1.0 + EXACT).tolist():
+            far = float(departed[tick, limb])
+            at_s = float(one.states.t_ns[tick] - one.states.t_ns[0]) / NS
+            row = {"at_s": round(at_s, 2), "horizon_s": horizon_s, "limb": BODY[limb]}
+            found.append(row | {"departed_m": round(far, 2), "m_per_s": round(far / horizon_s, 1)})
+    return found
 
 
 def _sizes(stage: PredictionStage, one: LimbDepartures, fold: Departure, coverage: float) -> dict[str, list[float]]:
@@ -303,7 +390,7 @@ def _sizes(stage: PredictionStage, one: LimbDepartures, fold: Departure, coverag
         "union_m3": union_m3(stage, one, fold),
         "union_without_legs_m3": union_m3(stage, one, fold, legs=False),
         "capsules_m3": capsules_m3(stage, one),
-        "fitted_to_it_m3": union_m3(stage, one, fit_departures([one], coverage)),
+        "fitted_to_it_m3": union_m3(stage, one, fit_departures([_settled(one)], coverage)),
     }
     return {name: [round(size, 3) for size in sizes] for name, sizes in found.items()}
 
@@ -311,7 +398,8 @@ def _sizes(stage: PredictionStage, one: LimbDepartures, fold: Departure, coverag
 def _missed(facts: dict[str, Any], coverage: float) -> str:
     """Returns the cases of held-out whole limbs with less than the required coverage."""
     wanted = [(facts["pooled_are"], facts["unknown"], coverage)]
-    wanted += [(log["name"], log["shares"], 1.0 - EACH * (1.0 - coverage)) for log in facts["logs"]]
+    fitted = [log for log in facts["logs"] if log["group"] not in facts["not_fitted"]]
+    wanted += [(log["name"], log["shares"], 1.0 - EACH * (1.0 - coverage)) for log in fitted]
     return "; ".join(
         f"{name}: found {share_text(share['share'])} at {h:g} s; would be right: at least {share_text(least)}"
         for name, shares, least in wanted

@@ -138,7 +138,8 @@ def scale_rates(limits: LimitSet, factor: float) -> LimitSet:
     grown = {name: factor * getattr(limits, name) for name in ("v_min", "v_max", "a_min", "a_max")}
     known = limits.departure
     if known is not None:
-        scaled = {name: factor * getattr(known, name) for name in ("beyond_m", "residuals", "rise_m", "sink_m")}
+        named = ("beyond_m", "residuals", "rise_m", "sink_m", "swings_s")
+        scaled = {name: factor * value for name in named if (value := getattr(known, name)) is not None}
         known = replace(known, **scaled)
     return replace(limits, name=f"{limits.name} x {factor:g}", departure=known, **grown)
 

@@ -54,8 +54,8 @@ class Departure:
 
     The body may be up to ``rise_m`` higher and ``sink_m`` lower than at constant velocity. Take the hull of the limb at
     the tick and at all these later positions (``human.prediction.velocity_tube``). Up to a horizon, no point of the
-    limb is further from this hull than ``beyond_m`` plus ``residuals`` times the limb's residual, as far as that is
-    noise; the bound is at least the residual.
+    limb is further from this hull than ``beyond_m``, plus ``swings_s`` times the limb's present speed, plus
+    ``residuals`` times its residual, as far as that is noise; the bound is at least the residual.
     """
 
     horizon_s: Floats  #: (h,) increasing [s]
@@ -63,6 +63,7 @@ class Departure:
     residuals: Floats  #: (7, h)
     rise_m: Floats  #: (h,) [m]
     sink_m: Floats  #: (h,) [m]
+    swings_s: Floats | None = None  #: (7, h) [m per m/s]; None: the bound does not depend on the speed
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,8 @@ class LimitSet:
         """Returns the JSON form; an infinite bound is null."""
         found = {name: _plain(value) for name, value in vars(self).items() if name != "departure"}
         if self.departure is not None:
-            found["departure"] = {name: value.tolist() for name, value in vars(self.departure).items()}
+            known = vars(self.departure).items()
+            found["departure"] = {name: value.tolist() for name, value in known if value is not None}
         return found
 
     @classmethod

@@ -23,6 +23,8 @@ _STRICT = ConfigDict(extra="forbid", frozen=True, strict=True)
 _PAIR = "[low, high] with low <= high"
 #: Rows of departures that do not belong to a limb.
 _OF_BODY = ("horizon_s", "rise_m", "sink_m")
+#: Rows of a limb; the last one may be left out.
+_OF_LIMB = ("beyond_m", "residuals", "swings_s")
 #: Description of a valid value, by the key.
 _RIGHT = {
     "coupled": "true or false",
@@ -32,8 +34,8 @@ _RIGHT = {
     "departure": f"horizon_s, rise_m, sink_m and a row for each of {', '.join(BODY)}, or leave it out",
     "horizon_s": "[s...], above 0 and increasing",
     **dict.fromkeys(("rise_m", "sink_m"), "a number for each horizon, at least 0"),
-    **dict.fromkeys(BODY, "a row with beyond_m, residuals"),
-    **dict.fromkeys(("beyond_m", "residuals"), "a number for each horizon"),
+    **dict.fromkeys(BODY, "a row with beyond_m, residuals, and swings_s or not"),
+    **dict.fromkeys(("beyond_m", "residuals", "swings_s"), "a number for each horizon"),
     "provenance": "a table, or leave it out",
 }
 
@@ -49,7 +51,8 @@ def load_limits(name_or_path: str | Path) -> LimitSet:
             rad..., m; per second; per second squared]. If coupled, alpha_2 and alpha_3 have no position; without a row
             ``z``, that of ``human`` is used. A table ``departure`` may bound the departure of limbs from constant
             velocity: ``horizon_s = [...]``, ``rise_m = [...]``, ``sink_m = [...]`` and a row ``{ beyond_m = [...],
-            residuals = [...] }`` for each of BODY. A table ``provenance`` may give the origin of the bounds; it has no
+            residuals = [...], swings_s = [...] }`` for each of BODY, the last one if the bounds grow with the limb's
+            present speed. A table ``provenance`` may give the origin of the bounds; it has no
             effect.
 
     Raises:
@@ -78,15 +81,18 @@ def _departure(table: dict[str, Any] | None, where: str) -> Departure | None:
         raise SettingsError(
             f"{where}: departure.horizon_s: found {table['horizon_s']}; would be right: {_RIGHT['horizon_s']}"
         )
-    rows = {f"{limb}.{name}": table[limb][name] for limb in BODY for name in ("beyond_m", "residuals")}
+    zeros = [0.0] * len(horizon_s)
+    table = table | {limb: table[limb] | {"swings_s": table[limb]["swings_s"] or zeros} for limb in BODY}
+    rows = {f"{limb}.{name}": table[limb][name] for limb in BODY for name in _OF_LIMB}
     for name, row in {**rows, "rise_m": table["rise_m"], "sink_m": table["sink_m"]}.items():
         if len(row) != len(horizon_s) or not (np.array(row) >= 0.0).all() or not np.isfinite(row).all():
             raise SettingsError(
                 f"{where}: departure.{name}: found {row}; would be right: {len(horizon_s)} numbers, one for each "
                 "horizon, at least 0"
             )
-    beyond, residuals = (np.array([table[limb][name] for limb in BODY]) for name in ("beyond_m", "residuals"))
-    return Departure(horizon_s, beyond, residuals, np.array(table["rise_m"]), np.array(table["sink_m"]))
+    beyond, residuals, swings = (np.array([table[limb][name] for limb in BODY]) for name in _OF_LIMB)
+    rise, sink = np.array(table["rise_m"]), np.array(table["sink_m"])
+    return Departure(horizon_s, beyond, residuals, rise, sink, swings if swings.any() else None)
 
 
 def write_limits(limits: LimitSet, provenance: dict[str, Any], path: Path) -> None:
@@ -122,6 +128,8 @@ def _toml(limits: LimitSet, provenance: dict[str, Any]) -> str:
         lines += [f"{name} = {_value(getattr(known, name).tolist())}" for name in _OF_BODY]
         for k, limb in enumerate(BODY):
             row = {"beyond_m": known.beyond_m[k].tolist(), "residuals": known.residuals[k].tolist()}
+            if known.swings_s is not None:
+                row["swings_s"] = known.swings_s[k].tolist()
             lines.append(f"{limb} = {_value(row)}")
     lines += ["", "[provenance]", *(f"{key} = {_value(value)}" for key, value in provenance.items())]
     return "\n".join(lines) + "\n"
@@ -161,6 +169,7 @@ class _LimbRow(BaseModel):
     model_config = _STRICT
     beyond_m: list[float]
     residuals: list[float]
+    swings_s: list[float] | None = None
 
 
 _rows: Any = dict.fromkeys(JOINTS, (_Row, ...)) | {"z": (_Row | None, None)}

@@ -70,6 +70,10 @@ _NOBODY = ("nobody_s", "nobody_else_s")
 _SHOWN = tuple(f"point_{point}_{axis}" for point in POINTS for axis in "xyz")
 
 
+def _shown_by(camera: str) -> tuple[str, ...]:
+    return tuple(f"{camera}_{name}" for name in _SHOWN)
+
+
 def state_columns(states: HumanStates) -> Columns:
     """Returns one row per tick and person: joints with derivatives and deviations, lengths, limbs, cameras used."""
     columns = with_person({"t_ns": states.t_ns}, states.person)
@@ -78,6 +82,9 @@ def state_columns(states: HumanStates) -> Columns:
     columns |= _spread(states.lengths_m, LENGTHS) | _spread(states.lengths_std_m, LENGTHS, "_std")
     columns |= _spread(states.residual_m, _RESIDUAL) | _spread(states.unseen_s, _UNSEEN)
     columns |= {_FRAME_AGE: states.frame_age_s} | _spread(states.points_m.reshape(len(states), -1), _SHOWN)
+    if states.camera_points_m is not None:
+        for i, camera in enumerate(states.cameras):
+            columns |= _spread(states.camera_points_m[:, i].reshape(len(states), -1), _shown_by(camera))
     columns |= {_AS_LENGTH: states.p[:, _HEIGHT], f"{_AS_LENGTH}_std": states.p_std[:, _HEIGHT]}
     columns |= {name: column for name in _NOBODY if (column := getattr(states, name)) is not None}
     return columns | {f"valid_{camera}": states.valid[:, i] for i, camera in enumerate(states.cameras)}
@@ -156,10 +163,18 @@ def _states(column: Columns, cameras: tuple[str, ...]) -> HumanStates:
         frame_age_s=column[_FRAME_AGE],
         points_m=_gather(column, _SHOWN).reshape(-1, len(POINTS), 3),
         cameras=cameras,
+        camera_points_m=_camera_points(column, cameras),
         nobody_s=column.get("nobody_s"),
         nobody_else_s=column.get("nobody_else_s"),
         person=column.get("person"),
     )
+
+
+def _camera_points(column: Columns, cameras: tuple[str, ...]) -> Floats | None:
+    """(n, c, 20, 3) points of each camera [m]; None in a table without them."""
+    if not all(_shown_by(camera)[0] in column for camera in cameras):
+        return None
+    return np.stack([_gather(column, _shown_by(camera)).reshape(-1, len(POINTS), 3) for camera in cameras], axis=1)
 
 
 def occupancy_columns(

@@ -22,7 +22,7 @@ _BACK_M = {"squat": 0.0, "chair": 0.25}
 _HIP_M = 0.09
 
 
-def _eased(t_s: Floats, duration_s: float) -> Floats:
+def eased(t_s: Floats, duration_s: float) -> Floats:
     """From 0 to 1 with the least jerk."""
     s = np.clip(t_s / duration_s, 0.0, 1.0)
     return np.asarray(s**3 * (10.0 - 15.0 * s + 6.0 * s**2))
@@ -36,7 +36,7 @@ def body(t_s: Floats, duration_s: float, kind: str) -> Floats:
         duration_s: How long to get up, and to go down [s].
         kind: ``squat`` (pelvis above the feet) or ``chair`` (behind them).
     """
-    up = _eased(t_s - STILL_S, duration_s) - _eased(t_s - 2.0 * STILL_S - duration_s, duration_s)
+    up = eased(t_s - STILL_S, duration_s) - eased(t_s - 2.0 * STILL_S - duration_s, duration_s)
     p = np.tile(NEUTRAL, (len(t_s), 1))
     p[:, 12] = STANDING_M - DOWN_M * (1.0 - up)
     p[:, 3] = 0.1 + _LEAN_RAD_PER_S * duration_s * 4.0 * up * (1.0 - up)  # forward on the way, upright at both ends

@@ -55,6 +55,7 @@ class MadeController:
             frame_age_s=np.full(1, np.inf),
             points_m=np.full((1, 20, 3), np.nan),
             cameras=("left", "right"),
+            camera_points_m=np.full((1, 2, 20, 3), np.nan),
         )
         vertices = np.arange(6 * 4 * 3).reshape(-1, 3) + np.tanh(self.p[0])
         offsets = np.arange(0, 4 * len(LIMBS) + 1, 4)

@@ -157,7 +157,7 @@ def main() -> None:
     """Writes the tables; exit code 5 where the constants are not those that this fit finds."""
     argparse.ArgumentParser(prog="python -m tests.tools.deviations", description=__doc__).parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        samples = [sample(run) for run in fused(Path(folder))]
+        samples = [sample(run) for run in fused(Path(folder)).values()]
     OUT.write_text("\n".join(lines(samples)))
     found = np.round(fit(samples), 2)
     if (found != FITTED).any():

@@ -22,8 +22,14 @@ REACH_M = 1.2
 _HAND_M = 0.3
 #: Distance of a foot's tip from its ankle, along the body's heading, until a camera has seen it: about a man's [m].
 FOOT_M = (0.2, 0.0, -0.06)
-#: Maximum age of the observation of a hand or a leg, a few frames of any camera; an older one is unknown [ns].
-_SHOWN_NS = 200_000_000
+#: Maximum age of the observation of a point, a few frames of any camera; an older hand or leg is unknown [ns].
+SHOWN_NS = 200_000_000
+#: Distance below which two places of a point are the same but for the noise of a tracker [m].
+ALIKE_M = 0.05
+#: Change of a bone's length beyond which the point at its far end is not on the limb.
+BROKEN = 0.3
+#: Number of observations after which the length of a leg's bone is known, and most that count in its mean.
+_BONES_KNOWN, _BONES_MOST = 20, 600
 
 (_SHOULDER_R, _ELBOW_R, _WRIST_R), (_SHOULDER_L, _ELBOW_L, _WRIST_L) = ARM_POINTS
 _LEGS = BODY.index("LEGS")
@@ -34,6 +40,10 @@ _OF_LIMB = np.array([LIMBS.index(limb) for limb in ("HD", "THX", "THX", "URA", "
 #: Wrists of HANDS, and the limbs that contain them.
 _WRISTS = np.array([_WRIST_R, _WRIST_L])
 _LOWER_ARMS = np.array([LIMBS.index("LRA"), LIMBS.index("LLA")])
+#: Points of the model but the neck, points attached to others, and all points that a camera shows on the body.
+_MODELLED = np.array([PELVIS, *_BESIDE])
+_ATTACHED = np.concatenate([HANDS, LEG_POINTS])
+_SHOWABLE = np.concatenate([_MODELLED, np.array([NECK]), _ATTACHED])
 #: Right, left.
 _ANKLES, _FEET = (np.array([POINTS.index(f"{part}_{side}") for side in "rl"]) for part in ("ankle", "foot"))
 
@@ -53,8 +63,8 @@ def shift(filter_: Filter, p: Floats, points: Floats) -> None:
 @njit(cache=True, inner=True)
 def learn(
     filter_: Filter, c: int, now: int, shown: Bools, p: Floats, model: Floats, shifted: Floats, rules: Rules
-) -> None:
-    """Updates the offsets by the points in a camera's frame.
+) -> int:
+    """Updates the offsets by the points in a camera's frame; returns the number of leg points on bones of wrong length.
 
     Args:
         filter_: Contains the frame; its offsets and observed positions are changed.
@@ -78,25 +88,81 @@ def learn(
                 beside += R[i, j] * (filter_.gate.points[c, k, i] - model[k, i])
             filter_.model.offset[k, j] += (beside - filter_.model.offset[k, j]) / weight
         filter_.model.offset_weight[k], filter_.model.offset_ns[k] = weight, now
+    _carry_body(filter_, c, model)
     for n, k in enumerate(HANDS):
-        if shown[_LOWER_ARMS[n]] and _near(filter_, c, k, filter_.gate.points[c, _WRISTS[n]], _HAND_M, rules):
+        if filter_.gate.shows[c, _LOWER_ARMS[n]] and _near(
+            filter_, c, k, filter_.gate.points[c, _WRISTS[n]], _HAND_M, rules
+        ):
             _carry(filter_, c, k, filter_.gate.points[c, k] - shifted[_WRISTS[n]])
-    if shown[_LEGS]:
-        _learn_legs(filter_, c, model[PELVIS], p[2], rules)
+    if filter_.gate.valid[c, :2].all():
+        return _learn_legs(filter_, c, now, model[PELVIS], p[2], rules)
+    return 0
 
 
 @njit(cache=True, inner=True)
-def _learn_legs(filter_: Filter, c: int, pelvis: Floats, heading: float, rules: Rules) -> None:
-    """Updates the legs below a pelvis (3,) by a camera's frame [m]."""
-    for k in LEG_POINTS:
-        if _near(filter_, c, k, pelvis, REACH_M, rules):
+def _carry_body(filter_: Filter, c: int, model: Floats) -> None:
+    """Stores where a camera shows the points of the model, from the model (20, 3); the neck between the shoulders."""
+    trusted, points = filter_.gate.trusted[c], filter_.gate.points[c]
+    for k in _MODELLED:
+        if trusted[k]:
+            _carry(filter_, c, k, points[k] - model[k])
+    right, left = _SHOULDER_R, _SHOULDER_L
+    if trusted[right] and trusted[left]:
+        _carry(filter_, c, NECK, 0.5 * (points[right] + points[left]) - model[NECK])
+
+
+@njit(cache=True, inner=True)
+def _learn_legs(filter_: Filter, c: int, now: int, pelvis: Floats, heading: float, rules: Rules) -> int:
+    """Updates the legs below a pelvis (3,) by a camera's frame [m]; returns the number of points left out."""
+    near = np.zeros(len(LEG_POINTS), np.bool_)
+    for n, k in enumerate(LEG_POINTS):
+        near[n] = _near(filter_, c, k, pelvis, REACH_M, rules)
+    found = near.sum()
+    for side in range(2):
+        for bone in range(2):
+            _compare_bone(filter_, c, now, side, bone, near)
+    for n, k in enumerate(LEG_POINTS):
+        if near[n]:
             from_below = filter_.gate.points[c, k].copy()
             from_below[:2] -= pelvis[:2]
             _carry(filter_, c, k, from_below)
     for side in range(2):
-        ankle, foot = _ANKLES[side], _FEET[side]
-        if _near(filter_, c, ankle, pelvis, REACH_M, rules) and _near(filter_, c, foot, pelvis, REACH_M, rules):
+        if near[4 + side] and near[6 + side]:
+            ankle, foot = _ANKLES[side], _FEET[side]
             filter_.model.foot[side] = _turned(filter_.gate.points[c, foot] - filter_.gate.points[c, ankle], -heading)
+    return found - near.sum()
+
+
+@njit(cache=True, inner=True)
+def _compare_bone(filter_: Filter, c: int, now: int, side: int, bone: int, near: Bools) -> None:
+    """Compares a thigh (bone 0) or shank (1) with the mean of the camera, and adds it or rules out what is below.
+
+    A bone keeps its length; a skeleton that falls apart before the tracker loses it does not. A new length that stays
+    is learnt: it may be another opinion of the same leg.
+
+    Args:
+        filter_: Contains the frame; the mean lengths are changed.
+        c: Index of the camera.
+        now: The tick [ns].
+        side: 0: right, 1: left.
+        bone: 0: thigh, 1: shank.
+        near: (8,) True for the points of LEG_POINTS that count; those below a bone of another length are set to False.
+    """
+    upper, lower = 2 * bone + side, 2 * bone + 2 + side
+    if not (near[upper] and near[lower]):
+        return
+    model = filter_.model
+    length = distance(filter_.gate.points[c, LEG_POINTS[upper]], filter_.gate.points[c, LEG_POINTS[lower]])
+    seen, mean = model.leg_bones_seen[c, bone], model.leg_bones[c, bone]
+    if seen >= _BONES_KNOWN:
+        if now - model.leg_bones_ns[c, bone] > SHOWN_NS:  # not a skeleton that falls apart: another length
+            seen = 0
+        elif abs(length - mean) > BROKEN * mean:
+            near[lower::2] = False
+            return
+    seen = min(seen + 1, _BONES_MOST)
+    model.leg_bones[c, bone] = mean + (length - mean) / seen
+    model.leg_bones_seen[c, bone], model.leg_bones_ns[c, bone] = seen, now
 
 
 @njit(cache=True, inner=True)
@@ -108,32 +174,82 @@ def _near(filter_: Filter, c: int, k: int, place: Floats, most: float, rules: Ru
 
 @njit(cache=True, inner=True)
 def _carry(filter_: Filter, c: int, k: int, relative: Floats) -> None:
-    if filter_.gate.capture_ns[c] >= filter_.model.carried_ns[k]:
-        filter_.model.carried[k], filter_.model.carried_ns[k] = relative, filter_.gate.capture_ns[c]
+    if filter_.gate.capture_ns[c] >= filter_.model.carried_ns[c, k]:
+        filter_.model.carried[c, k], filter_.model.carried_ns[c, k] = relative, filter_.gate.capture_ns[c]
 
 
 @njit(cache=True, inner=True)
-def place(filter_: Filter, p: Floats, points: Floats) -> None:
+def distance_shown(filter_: Filter, c: int, k: int, plain: Floats, model: Floats, now: int) -> float:
+    """Distance of a point in a camera's frame from where the volumes expect it [m].
+
+    That is the line between the model with the recent offsets and where this camera showed the point before, if the two
+    are apart: both are in the volumes (``place``).
+
+    Args:
+        filter_: Contains the frame.
+        c: Index of the camera.
+        k: Index of the point.
+        plain: (20, 3) the model's points at the capture time [m].
+        model: (20, 3) the same with the recent offsets [m].
+        now: The tick [ns].
+    """
+    point, start = filter_.gate.points[c, k], model[k]
+    if now - filter_.model.carried_ns[c, k] > SHOWN_NS:
+        return distance(point, start)
+    along = plain[k] + filter_.model.carried[c, k] - start
+    apart = np.sqrt((along**2).sum())
+    if apart <= ALIKE_M:
+        return distance(point, start)
+    most = 1.0 - ALIKE_M / apart
+    share = max(0.0, min(most, ((point - start) * along).sum() / apart**2))
+    return distance(point, start + share * along)
+
+
+@njit(cache=True, inner=True)
+def place(filter_: Filter, p: Floats, points: Floats, camera_points: Floats) -> None:
     """Writes the points at the tick; NaN for hands and legs that no camera has observed recently.
 
     Args:
         filter_: After the tick.
         p: (13,) the posture [m, m, rad..., m].
         points: (20, 3) receives the points, world [m].
+        camera_points: (c, 20, 3) receives the recent points of each camera, world [m]; while the torso is seen, only
+            those further than ``ALIKE_M`` from ``points``, and but for legs that much nearer to them, so that volumes
+            do not jump.
     """
     skeleton_row(p, filter_.estimate.lengths, points)
+    base = points.copy()
     shift(filter_, p, points)
-    now = filter_.estimate.tick_ns[0]
     for n, k in enumerate(HANDS):
-        if now - filter_.model.carried_ns[k] <= _SHOWN_NS:
-            points[k] = points[_WRISTS[n]] + filter_.model.carried[k]
+        base[k] = points[_WRISTS[n]]
     for k in LEG_POINTS:
-        if now - filter_.model.carried_ns[k] <= _SHOWN_NS:
-            points[k] = filter_.model.carried[k]
-            points[k, :2] += points[PELVIS, :2]
+        base[k, :2], base[k, 2] = points[PELVIS, :2], 0.0
+    now = filter_.estimate.tick_ns[0]
+    for k in _ATTACHED:
+        c = filter_.model.carried_ns[:, k].argmax()
+        if now - filter_.model.carried_ns[c, k] <= SHOWN_NS:
+            points[k] = base[k] + filter_.model.carried[c, k]
     for side in range(2):
         if np.isnan(points[_FEET[side], 0]):
             points[_FEET[side]] = points[_ANKLES[side]] + _turned(filter_.model.foot[side], p[2])
+    _place_shown(filter_, base, points, camera_points)
+
+
+@njit(cache=True, inner=True)
+def _place_shown(filter_: Filter, base: Floats, points: Floats, camera_points: Floats) -> None:
+    """Writes the points of each camera (c, 20, 3), from what they are carried with, ``base`` (20, 3) [m]."""
+    now = filter_.estimate.tick_ns[0]
+    sees_torso = now - filter_.estimate.row_ns[:4].min() <= SHOWN_NS
+    for c in range(len(camera_points)):
+        for k in _SHOWABLE:
+            if now - filter_.model.carried_ns[c, k] > SHOWN_NS:
+                continue
+            there = base[k] + filter_.model.carried[c, k]
+            apart = distance(there, points[k])
+            if not sees_torso or np.isnan(apart):
+                camera_points[c, k] = there
+            elif apart > ALIKE_M:
+                camera_points[c, k] = there if k in LEG_POINTS else there + (points[k] - there) * (ALIKE_M / apart)
 
 
 @njit(cache=True, inner=True)

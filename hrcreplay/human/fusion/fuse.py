@@ -34,9 +34,11 @@ from hrcreplay.settings.sections import Fusion
 #: Prior of an unmeasured person: upright with hanging arms, and its standard deviation [m, m, rad..., m].
 _NEUTRAL = (0.0, 0.0, 0.0, 0.1, 0.1, 0.3, 0.0, 2.6, 0.1, 0.3, 0.0, 2.6, 0.94)
 _NEUTRAL_STD = (0.5, 0.5, 1.5, 0.5, *(0.7, 0.7, 1.5, 0.7) * 2, 0.3)
-#: LENGTHS of the median man (upper arm 0.36 m, shoulders at 1.44 m), and their standard deviation [m].
+#: LENGTHS of the median man (upper arm 0.36 m, shoulders at 1.44 m), and their standard deviation [m]: statures of men
+#: and women differ by 0.09 m (ANSUR II, 2012), bones by 0.13 to 0.29 of that (Drillis and Contini, 1966), and the joint
+#: centres of trackers by some centimetres more.
 MEDIAN_LENGTHS_M = (0.50, 0.20, 0.18, 0.36, 0.36, 0.29, 0.29)
-_LENGTHS_STD_M = 0.1
+_LENGTHS_STD_M = (0.06, 0.06, 0.04, 0.05, 0.05, 0.04, 0.04)
 #: Standard deviations of v, a, j of an unseen joint: of x, y and z [m/s...], of an angle [rad/s...].
 _REST_STD = np.array([[0.3, 2.0, 20.0]] * 2 + [[0.5, 5.0, 50.0]] * 10 + [[0.3, 2.0, 20.0]])
 #: Type of a joint: x or y (0), an angle (1) or z (2).
@@ -78,7 +80,7 @@ def start(cameras: tuple[str, ...]) -> FusionState:
             mean=mean,
             cov=cov,
             lengths=np.array(MEDIAN_LENGTHS_M),
-            lengths_var=np.full(len(LENGTHS), _LENGTHS_STD_M**2),
+            lengths_var=np.array(_LENGTHS_STD_M) ** 2,
             row_ns=np.full(ROWS, NEVER_NS),
             acquired_ns=np.full(ROWS, NEVER_NS),
             bone_ns=np.full(len(LENGTHS), NEVER_NS),
@@ -101,6 +103,7 @@ def start(cameras: tuple[str, ...]) -> FusionState:
             confidence=np.zeros((c, len(POINTS))),
             valid=np.zeros((c, ROWS), dtype=np.bool_),
             shows=np.zeros((c, len(LIMBS)), dtype=np.bool_),
+            trusted=np.zeros((c, len(POINTS)), dtype=np.bool_),
         ),
         model=ModelResidual(
             residuals=np.zeros((len(BODY), BINS)),
@@ -113,8 +116,11 @@ def start(cameras: tuple[str, ...]) -> FusionState:
             offset=np.zeros((len(POINTS), 3)),
             offset_weight=np.zeros(len(POINTS)),
             offset_ns=np.full(len(POINTS), NEVER_NS),
-            carried=np.full((len(POINTS), 3), np.nan),
-            carried_ns=np.full(len(POINTS), NEVER_NS),
+            carried=np.full((c, len(POINTS), 3), np.nan),
+            carried_ns=np.full((c, len(POINTS)), NEVER_NS),
+            leg_bones=np.zeros((c, 2)),
+            leg_bones_seen=np.zeros((c, 2), dtype=np.int64),
+            leg_bones_ns=np.full((c, 2), NEVER_NS),
             foot=np.tile(FOOT_M, (2, 1)),
         ),
     )
@@ -182,6 +188,7 @@ def fuse(
         frame_age_s=track.frame_age,
         points_m=track.points,
         cameras=measurements.cameras,
+        camera_points_m=track.camera_points,
     )
     counts = Counter({"joints_reacquired": int(track.reacquired[0]), "ticks_saturated": int(track.saturated[0])})
     for c, camera in enumerate(measurements.cameras):
@@ -265,6 +272,7 @@ def _track(n: int, cameras: int, *, traced: bool) -> Track:
         unseen=np.full((n, len(BODY)), np.inf),
         frame_age=np.full(n, np.inf),
         points=np.full((n, len(POINTS), 3), np.nan),
+        camera_points=np.full((n, cameras, len(POINTS), 3), np.nan),
         cov=np.full((rows, DOF, 4, 4), np.nan),
         damping=np.ones((rows, DOF)),
         spread=np.full((rows, DOF), np.nan),

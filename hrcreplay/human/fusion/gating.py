@@ -78,9 +78,10 @@ def validate_frame(filter_: Filter, c: int, now: int, rules: Rules, track: Track
                 filter_.estimate.row_ns[row], now - rules.memory_ns - 1
             )  # lost: it restarts
     confidence, points = filter_.gate.confidence[c], filter_.gate.points[c]
+    filter_.gate.trusted[c] = False
     for point in _TESTED:
         if trusted[point] and confidence[point] >= rules.confidence_min and np.isfinite(points[point, 0]):
-            filter_.gate.point_ns[point] = now
+            filter_.gate.point_ns[point], filter_.gate.trusted[c, point] = now, True
     for limb in range(len(_PLACING)):
         product, agrees = 1.0, True
         for k in range(len(trusted)):

@@ -50,6 +50,7 @@ class Gate(NamedTuple):
     confidence: Floats  #: (c, 20)
     valid: Bools  #: (c, 20) True for its used rows
     shows: Bools  #: (c, 6) True for limbs that it shows, together with all limbs that carry them
+    trusted: Bools  #: (c, 20) True for its points that agree with the filter, or are believed
 
 
 class ModelResidual(NamedTuple):
@@ -65,8 +66,11 @@ class ModelResidual(NamedTuple):
     offset: Floats  #: (20, 3) running mean of the points' offsets from the model, in the torso's frame [m]
     offset_weight: Floats  #: (20,) sum of the weights in that mean
     offset_ns: Ints  #: (20,) tick of the last sample
-    carried: Floats  #: (20, 3) hands from the wrist, legs from below the pelvis, world [m]
-    carried_ns: Ints  #: (20,) capture of that observation
+    carried: Floats  #: (c, 20, 3) each camera's hands from the wrist, legs from below the pelvis, others from the model
+    carried_ns: Ints  #: (c, 20) capture of that observation
+    leg_bones: Floats  #: (c, 2) mean length of the thighs and shanks that a camera shows [m]
+    leg_bones_seen: Ints  #: (c, 2) number of observations in that mean
+    leg_bones_ns: Ints  #: (c, 2) tick at which one last agreed with it
     foot: Floats  #: (2, 3) last observed offset of the right and left foot from the ankle, in the body's heading [m]
 
 
@@ -132,6 +136,7 @@ class Track(NamedTuple):
     unseen: Floats  #: (n, 7)
     frame_age: Floats  #: (n,)
     points: Floats  #: (n, 20, 3)
+    camera_points: Floats  #: (n, c, 20, 3)
     cov: Floats  #: (n or 0, 13, 4, 4)
     damping: Floats  #: (n or 0, 13) of the derivatives, on the way to the tick
     spread: Floats  #: (n or 0, 13) of the filter

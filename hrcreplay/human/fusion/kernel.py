@@ -17,6 +17,8 @@ from hrcreplay.human.model import LEFT_ARM, RIGHT_ARM, canonical_arm, clamp_row,
 from hrcreplay.kernels import njit
 from hrcreplay.records import DOF, Floats, Ints
 
+#: Number of frames whose errors of a length are alike: a tracker that sees a bone too short does so for a while.
+_ALIKE = 10.0
 #: Hysteresis between the two forms of an arm's angles [rad].
 _NAME_MARGIN = np.radians(20.0)
 
@@ -47,7 +49,7 @@ def run(ticks_ns: Ints, frames: Frames, filter_: Filter, rules: Rules, track: Tr
             if fresh[c]:
                 validate_frame(filter_, c, now, rules, track)
         if filter_.estimate.started[0]:
-            observe(filter_, fresh, now, rules)
+            observe(filter_, fresh, now, rules, track.outliers)
         for c in range(len(fresh)):
             again = rules.reuse and filter_.gate.uses[c] > 0 and now - filter_.gate.capture_ns[c] <= rules.memory_ns
             if fresh[c] or again:
@@ -113,6 +115,7 @@ def _update(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> bo
             continue
         R = filter_.gate.uses[c] * filter_.gate.z_var[c, row]
         if row >= DOF:
+            R *= _ALIKE
             both = filter_.estimate.lengths_var[row - DOF] + R
             if both > 0.0:  # else the length is known exactly, and so is the row
                 gain = filter_.estimate.lengths_var[row - DOF] / both
@@ -192,7 +195,7 @@ def _leave(filter_: Filter, k: int, rules: Rules, track: Track, damping: Floats)
     write_residual(filter_, filter_.estimate.tick_ns[0], rules, track.residual[k])
     write_unseen_times(filter_, track.unseen[k])
     track.frame_age[k] = (filter_.estimate.tick_ns[0] - filter_.gate.newest_ns[0]) * 1e-9
-    place(filter_, filter_.estimate.mean[:, 0].copy(), track.points[k])
+    place(filter_, filter_.estimate.mean[:, 0].copy(), track.points[k], track.camera_points[k])
     if len(track.cov) > 0:
         track.cov[k] = filter_.estimate.cov
         track.damping[k] = damping

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hrcreplay.human.fusion.body_points import REACH_M, learn, shift
+from hrcreplay.human.fusion.body_points import REACH_M, distance_shown, learn, shift
 from hrcreplay.human.fusion.gating import distance
 from hrcreplay.human.fusion.kalman import Filter, Rules, delay, extrapolate_back
 from hrcreplay.human.model import ARM_POINTS, BENDS, HEAD, HEIGHT, LEFT_ARM, PELVIS, RIGHT_ARM, skeleton_row
@@ -52,7 +52,7 @@ _BELOW = np.array([POINTS.index(f"{part}_{side}") for part in ("knee", "ankle", 
 
 
 @njit(cache=True, inner=True)
-def observe(filter_: Filter, fresh: Bools, now: int, rules: Rules) -> None:
+def observe(filter_: Filter, fresh: Bools, now: int, rules: Rules, outliers: Ints) -> None:
     """Adds the samples of the cameras' new frames and recomputes the quantiles of those limbs.
 
     Args:
@@ -60,6 +60,7 @@ def observe(filter_: Filter, fresh: Bools, now: int, rules: Rules) -> None:
         fresh: (c,) True if the stored frame of a camera is new.
         now: The tick [ns].
         rules: Settings of the filter.
+        outliers: (c,) number of a camera's points that disagree with the person; those of broken legs are added.
     """
     for c in np.flatnonzero(fresh):
         p = extrapolate_back(filter_.estimate.mean, delay(filter_, c, now, rules))
@@ -75,14 +76,14 @@ def observe(filter_: Filter, fresh: Bools, now: int, rules: Rules) -> None:
         for limb in np.flatnonzero(shown[:_LEGS]):
             sample = 0.0
             for k in _ENDS[limb]:
-                sample = max(sample, distance(filter_.gate.points[c, k], model[k]))
+                sample = max(sample, distance_shown(filter_, c, k, plain, model, now))
             _enter(filter_, limb, now, sample, rules)
         if shown[_LEGS]:
             below = _farthest(filter_, c, _BELOW, model[PELVIS], rules)
             if below >= 0.0:
                 sample = max(below, _farthest(filter_, c, _HIPS, model[PELVIS], rules))
                 _enter(filter_, np.int64(_LEGS), now, sample, rules)  # as above: numba compiles constants anew
-        learn(filter_, c, now, shown, p, plain, model, rules)
+        outliers[c] += learn(filter_, c, now, shown, p, plain, model, rules)
     for limb in np.flatnonzero(filter_.model.sampled_ns == now):
         if filter_.model.samples[limb] >= LEAST:
             larger = (1.0 - rules.residual_quantile) * filter_.model.weight[limb]
@@ -171,7 +172,10 @@ def write_unseen_times(filter_: Filter, seconds: Floats) -> None:
     seconds[:2] = _since(now, filter_.estimate.row_ns[:4].min())
     for i in range(len(_FIRST)):
         seconds[2 + i] = _since(now, filter_.estimate.row_ns[_FIRST[i] : _FIRST[i] + 2].max())
-    seconds[_LEGS] = _since(now, filter_.model.carried_ns[BENDS].min())
+    seen = now
+    for k in BENDS:
+        seen = min(seen, filter_.model.carried_ns[:, k].max())
+    seconds[_LEGS] = _since(now, seen)
 
 
 @njit(cache=True, inner=True)

@@ -63,6 +63,8 @@ from hrcreplay.human.prediction.velocity_tube import (
     Tubes,
     departs_m,
     departure_table,
+    displaced_m,
+    speed_of,
     tube,
     tubes,
     velocities,
@@ -73,6 +75,8 @@ from hrcreplay.settings.sections import Prediction
 
 #: Added to every radius: more than the sum of all rounding errors [m].
 ROUNDING_M = 1e-9
+#: Added to the radius of legs out of sight: departures were fitted to legs that cameras show [m].
+HIDDEN_M = 0.06
 #: Maximum number of points after a rotation or walking; above it the polytope around them is used.
 MOST_COPIED = 2000
 #: Number of points above which walking uses triangles of 60 degrees.
@@ -179,8 +183,7 @@ def _radii_rows(rows: SoundRows, residual: Floats, rules: SoundRules) -> None:
     for i in range(len(found)):
         skeleton_row(rows.at.p[i], rows.lengths[i], modelled)
         off = rows.lengths_off[i]
-        shoulder = np.hypot(off[0], off[2])
-        displaced = (0.0, 0.0, shoulder, shoulder + off[4], shoulder, shoulder + off[3])
+        displaced = displaced_m(off)
         for limb in range(found.shape[1]):
             base = rules.legs_m + ROUNDING_M if limb == LEGS else rules.limbs_m[limb] + displaced[limb] + ROUNDING_M
             of = THORAX if limb == LEGS else limb
@@ -222,7 +225,7 @@ def sweep_sound(
     offsets = np.zeros((last - first) * limbs + 1, np.int64)
     vertices = np.empty(((last - first) * limbs * 80 + 80, 3))
     low, high, corners = np.empty(DOF), np.empty(DOF), np.empty((SIDES, 2))
-    velocity, short = np.empty((len(POINTS), 3)), np.empty((MOST_POINTS, 3))
+    velocity, short = np.empty((len(POINTS), 3)), np.empty(((1 + rows.tubed.camera_points.shape[1]) * MOST_POINTS, 3))
     n = 0
     for i in range(first, last):
         if not rows.tubed.usable[i, :limbs].all():
@@ -251,13 +254,16 @@ def _tube(
     """Writes the points of a limb's tube; returns their number and the radius, which includes the limb's [m]."""
     tubed, thick = rows.tubed, rules.body_m[limb]
     reach_s = span_s + tubed.late_s[i, limb]
-    count = tube(limb, tubed.points[i], velocity, span_s, reach_s, rules.hand_m, rules.departure, swept)
+    points, shown = tubed.points[i], tubed.camera_points[i]
+    count = tube(limb, points, shown, velocity, span_s, reach_s, rules.hand_m, rules.departure, swept)
+    speed = speed_of(limb, velocity)
     if limb == LEGS and not tubed.legs_shown[i]:
-        hidden = max(rules.legs_m, knees_out(rows.at.p[i, HEIGHT]) + THIGH_M) + ROUNDING_M
+        speed = 0.0  # their radius was fitted to nobody who walks
+        hidden = max(rules.legs_m, knees_out(rows.at.p[i, HEIGHT]) + THIGH_M) + HIDDEN_M + ROUNDING_M
         thick = np.fmax(hidden, tubed.legs_m[i] + rules.body_m[limb])
     if not np.isfinite(swept[:count].sum()):
         swept[0], count = np.nan, 1
-    return count, thick + departs_m(limb, reach_s, tubed.residual[i, limb], rules.departure)
+    return count, thick + departs_m(limb, reach_s, tubed.residual[i, limb], speed, rules.departure)
 
 
 @njit(cache=True)

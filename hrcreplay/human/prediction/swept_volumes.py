@@ -19,12 +19,13 @@ from hrcreplay.human.model import (
     HEIGHT,
     RHO,
     SHOWN_BY,
+    THX,
     LimitSet,
     alpha_2_bounds,
     alpha_3_bounds,
     bounds_of,
 )
-from hrcreplay.human.prediction.shown_points import around_points, count_by_points
+from hrcreplay.human.prediction.shown_points import around_points, bound_by_seen, count_by_points
 from hrcreplay.human.prediction.sound_reach import SoundMotionLimits, enclose, start_states
 from hrcreplay.human.prediction.sound_volumes import SoundRows, SoundRules, sound_rows, sound_rules, sweep_sound
 from hrcreplay.human.prediction.sweep import MOST_COPIES, append, box, kinematic_chain, sweep_rot, sweep_walk
@@ -301,15 +302,26 @@ class PreparedPerson:
             last: Tick after the last one; None: all.
         """
         last, prediction = len(self.states) if last is None else last, self.predictor.prediction
+        found = self._filtered(horizon_s, first, last)
         if self.by_points[first:last].any():
-            found, states = self._filtered(horizon_s, first, last), self.states.rows(slice(first, last))
-            return around_points(found, states, prediction, self.predictor.limbs_m, horizon_s)
-        return self._filtered(horizon_s, first, last)
+            states = self.states.rows(slice(first, last))
+            found = around_points(found, states, prediction, self.predictor.limbs_m, horizon_s)
+        if self.partly_seen[first:last].any():
+            rows = np.flatnonzero(self.partly_seen[first:last])
+            found = bound_by_seen(found, self.states.rows(slice(first, last)), rows, prediction, horizon_s)
+        return found
 
     @cached_property
     def by_points(self) -> Bools:
         """(n,) True for rows of bodies that count by their points alone."""
         return count_by_points(self.states)
+
+    @cached_property
+    def partly_seen(self) -> Bools:
+        """(n,) True for known people whose torso has no tube although limits bound departures: it is out of sight."""
+        if self.rows is None or not self.predictor.rules.bounded or self.states.camera_points_m is None:
+            return np.zeros(len(self.states), dtype=np.bool_)
+        return ~self.rows.tubed.usable[:, THX] & np.isfinite(self.states.p[:, 0])
 
     def _filtered(self, horizon_s: float, first: int, last: int) -> SweptVolumes:
         """Volumes from the filtered states; unknown for bodies that have none."""

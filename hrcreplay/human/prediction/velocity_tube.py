@@ -4,7 +4,10 @@ Worst-case bounds on thirteen joints enclose two to three times the volume that 
 bound the departure of whole limbs from constant velocity (``Departure``), fitted on recordings. The tube of a limb is
 the hull of its ends at the tick and after the horizon, raised and lowered as people stand up and sit down, with a ball
 around it; a person who stops or slows down stays in that hull. No motion within the bound leaves the tube, for any
-motion of the joints.
+motion of the joints. Where a camera shows a limb away from the fused one, the hull contains both.
+
+The ball is the sum of where the limb is now (a multiple of its residual) and of where it can go. The latter grows with
+the limb's present speed: someone who swings an arm already departs further than someone who stands still.
 """
 
 from __future__ import annotations
@@ -15,7 +18,7 @@ import numpy as np
 
 from hrcreplay.human.model import ARM_POINTS, BENDS, HANDS, HEAD, LEG_POINTS, NECK, PELVIS, LimitSet, skeleton_row
 from hrcreplay.kernels import njit
-from hrcreplay.records import BODY, Bools, Floats, HumanStates
+from hrcreplay.records import BODY, POINTS, Bools, Floats, HumanStates
 
 #: Time step of the difference that gives the velocities of the points [s].
 _STEP_S = 1e-4
@@ -27,6 +30,9 @@ NOISE_M = 0.2
 _CARRIES_S, _CARRIES_ARMS_S = 0.25, 0.15
 #: Speed of a swinging leg relative to the body: each foot rests about half of the time.
 _STRIDE = 2.0
+#: Age of the frame in which legs are mostly seen: since then they were carried with the pelvis, but one stood still and
+#: the other one swung [s].
+_LEGS_AGE_S = 0.07
 #: Minimum distance of a hand from its wrist that gives a direction [m].
 _SHORT_M = 0.02
 HEAD_LIMB, THORAX, LEGS = (BODY.index(limb) for limb in ("HD", "THX", "LEGS"))
@@ -34,15 +40,30 @@ HEAD_LIMB, THORAX, LEGS = (BODY.index(limb) for limb in ("HD", "THX", "LEGS"))
 _CARRIED_BY = np.zeros((7, 7), dtype=np.bool_)
 for _limb, _carrying in enumerate(((0, 1), (1,), (1, 2), (1, 2, 3), (1, 4), (1, 4, 5), (1,))):
     _CARRIED_BY[_limb, _carrying] = True
-#: Maximum number of points of a tube.
+#: Speed above which the bound on a limb's departure grows no further [m/s].
+FASTEST_M_PER_S = 1.0
+#: Standard deviations of the lengths that count while the residual is unknown.
+_LENGTHS_OFF = 2.0
+#: Maximum number of points of a tube for the fused limb, and for each camera.
 MOST_POINTS = 2 * (len(LEG_POINTS) + 2)
 _ARMS = np.array(ARM_POINTS)
+#: Ends of each of BODY, repeated where there are fewer than three, and their number; of the legs the pelvis.
+_ENDS_OF = np.array(
+    [
+        (NECK, HEAD, HEAD),
+        (PELVIS, ARM_POINTS[0][0], ARM_POINTS[1][0]),
+        *((*ARM_POINTS[arm][part : part + 2], ARM_POINTS[arm][part]) for arm in range(2) for part in range(2)),
+        (PELVIS, PELVIS, PELVIS),
+    ]
+)
+_ENDS = np.array([2, 3, 2, 2, 2, 2, 1])
 
 
 class Tubes(NamedTuple):
     """Data of the tubes, one row per tick."""
 
     points: Floats  #: (n, 20, 3) of ``HumanStates.points_m``
+    camera_points: Floats  #: (n, c, 20, 3) of ``HumanStates.camera_points_m``; c = 0 if they are not known
     residual: Floats  #: (n, 7) residual of each limb of BODY, multiplied by ``residuals`` [m]
     usable: Bools  #: (n, 7) True: the limb has a tube
     legs_shown: Bools  #: (n,) True: the positions of both knees and ankles are known
@@ -56,6 +77,7 @@ class DepartureTable(NamedTuple):
     horizon_s: Floats  #: (h,)
     beyond_m: Floats  #: (7, h)
     residuals: Floats  #: (7, h)
+    swings_s: Floats  #: (7, h)
     rise_m: Floats  #: (h,) [m]
     sink_m: Floats  #: (h,) [m]
 
@@ -64,8 +86,9 @@ def departure_table(limits: LimitSet) -> DepartureTable:
     """Makes the table of a limit set."""
     known = limits.departure
     if known is None:
-        return DepartureTable(np.ones(1), np.zeros((len(BODY), 1)), np.zeros((len(BODY), 1)), np.zeros(1), np.zeros(1))
-    arrays = known.horizon_s, known.beyond_m, known.residuals, known.rise_m, known.sink_m
+        return DepartureTable(np.ones(1), *np.zeros((3, len(BODY), 1)), *np.zeros((2, 1)))
+    swings_s = np.zeros_like(known.beyond_m) if known.swings_s is None else known.swings_s
+    arrays = known.horizon_s, known.beyond_m, known.residuals, swings_s, known.rise_m, known.sink_m
     return DepartureTable(*(np.ascontiguousarray(array) for array in arrays))
 
 
@@ -78,9 +101,10 @@ def tubes(states: HumanStates, bounded: bool, unknown_m: float, memory_s: float)
         unknown_m: Distance from the model until it is known; NaN: distances from the model are not used [m].
         memory_s: Time for which the filter continues without a measurement [s].
     """
-    n = len(states)
+    n, shown = len(states), states.camera_points_m
     found = Tubes(
         points=np.ascontiguousarray(states.points_m),
+        camera_points=np.empty((n, 0, len(POINTS), 3)) if shown is None else np.ascontiguousarray(shown),
         residual=np.zeros((n, len(BODY))),
         usable=np.zeros((n, len(BODY)), dtype=np.bool_),
         legs_shown=np.empty(n, dtype=np.bool_),
@@ -88,7 +112,8 @@ def tubes(states: HumanStates, bounded: bool, unknown_m: float, memory_s: float)
         late_s=np.empty((n, len(BODY))),
     )
     unseen_s, residual_m = np.ascontiguousarray(states.unseen_s), np.ascontiguousarray(states.residual_m)
-    _tube_rows(unseen_s, residual_m, bounded, unknown_m, memory_s, found)
+    off_m = np.ascontiguousarray(_LENGTHS_OFF * states.lengths_std_m)
+    _tube_rows(unseen_s, residual_m, off_m, bounded, unknown_m, memory_s, found)
     return found
 
 
@@ -96,12 +121,14 @@ def tubes(states: HumanStates, bounded: bool, unknown_m: float, memory_s: float)
 def _tube_rows(
     unseen_s: Floats,
     residual_m: Floats,
+    off_m: Floats,
     bounded: bool,
     unknown_m: float,
     memory_s: float,
     found: Tubes,
 ) -> None:
     for i in range(len(unseen_s)):
+        displaced = displaced_m(off_m[i])
         found.legs_shown[i] = np.isfinite(found.points[i][BENDS].sum())
         for limb in range(len(BODY)):
             unseen = -np.inf
@@ -114,14 +141,22 @@ def _tube_rows(
             found.late_s[i, limb] = np.minimum(np.maximum(unseen - _FRESH_S, 0.0), memory_s)
             if not np.isnan(unknown_m):
                 # the residual of the legs is not related to departures
-                own = residual_m[i, THORAX if limb == LEGS else limb]
-                found.residual[i, limb] = unknown_m if np.isnan(own) else own
+                of = THORAX if limb == LEGS else limb
+                own = residual_m[i, of]
+                found.residual[i, limb] = unknown_m + displaced[of] if np.isnan(own) else own
         if not np.isnan(unknown_m):
             found.legs_m[i] = residual_m[i, LEGS]
 
 
 @njit(cache=True)
-def departs_m(limb: int, reach_s: float, residual_m: float, table: DepartureTable) -> float:
+def displaced_m(off: Floats) -> tuple[float, float, float, float, float, float]:
+    """Displacement of the far ends of LIMBS by errors (7,) of the lengths up the chain [m]; the own length is apart."""
+    shoulder = np.hypot(off[0], off[2])
+    return 0.0, 0.0, shoulder, shoulder + off[4], shoulder, shoulder + off[3]
+
+
+@njit(cache=True)
+def departs_m(limb: int, reach_s: float, residual_m: float, speed: float, table: DepartureTable) -> float:
     """Largest departure of a limb until ``reach_s`` [m].
 
     At least the residual, as the limb may already be there.
@@ -130,9 +165,11 @@ def departs_m(limb: int, reach_s: float, residual_m: float, table: DepartureTabl
         limb: Index into BODY.
         reach_s: Time since the tick [s].
         residual_m: The limb's residual [m]
+        speed: Present speed of the limb [m/s].
         table: The bounds.
     """
     beyond = _until(reach_s, table.horizon_s, table.beyond_m[limb])
+    beyond += min(speed, FASTEST_M_PER_S) * _until(reach_s, table.horizon_s, table.swings_s[limb])
     times = np.interp(reach_s, table.horizon_s, table.residuals[limb])
     return max(residual_m, beyond + times * min(residual_m, NOISE_M) + max(0.0, residual_m - NOISE_M))
 
@@ -168,9 +205,35 @@ def velocities(p: Floats, v: Floats, lengths: Floats, found: Floats) -> None:
 
 
 @njit(cache=True)
+def speed_of(limb: int, velocity: Floats) -> float:
+    """Speed of the fastest end of a limb; of the legs that of the pelvis [m/s]; ``velocity`` (20, 3) [m/s]."""
+    most = 0.0
+    for k in _ENDS_OF[limb]:
+        most = max(most, np.sqrt((velocity[k] ** 2).sum()))
+    return most
+
+
+def limb_speeds(states: HumanStates) -> Floats:
+    """(n, 7) present speeds of the limbs of BODY, up to ``FASTEST_M_PER_S`` [m/s]."""
+    found = np.empty((len(states), len(BODY)))
+    _speed_rows(*(np.ascontiguousarray(part) for part in (states.p, states.v, states.lengths_m)), found)
+    return found
+
+
+@njit(cache=True)
+def _speed_rows(p: Floats, v: Floats, lengths: Floats, found: Floats) -> None:
+    velocity = np.empty((len(POINTS), 3))
+    for i in range(len(p)):
+        velocities(p[i], v[i], lengths[i], velocity)
+        for limb in range(found.shape[1]):
+            found[i, limb] = min(speed_of(limb, velocity), FASTEST_M_PER_S)
+
+
+@njit(cache=True)
 def tube(
     limb: int,
     points: Floats,
+    shown: Floats,
     velocity: Floats,
     span_s: float,
     reach_s: float,
@@ -185,17 +248,23 @@ def tube(
     Args:
         limb: Index into BODY.
         points: (20, 3) positions of the body's points [m].
+        shown: (c, 20, 3) where each camera shows them, if not there; otherwise NaN [m].
         velocity: (20, 3) of the model's points [m/s].
         span_s: Horizon and latency [s].
         reach_s: Time after the tick until which the limb may depart [s].
         hand_m: Length of the hand beyond the wrist [m].
         table: The bounds.
-        swept: (MOST_POINTS, 3) receives the points.
+        swept: ((1 + c) MOST_POINTS, 3) receives the points.
     """
     carries_s = _CARRIES_S if limb in (HEAD_LIMB, THORAX, LEGS) else _CARRIES_ARMS_S
     unmeasured_s = max(0.0, span_s - table.horizon_s[-1])  # for these points only the velocity is known
-    n = _ends(limb, points, velocity, min(span_s, carries_s + unmeasured_s), hand_m, swept)
-    rising = 2 if limb == LEGS else n
+    carries_s = min(span_s, carries_s + unmeasured_s)
+    n = _ends(limb, points, shown, velocity, carries_s, hand_m, swept)
+    rising = n
+    if limb == LEGS:
+        rising = 2
+        for c in range(len(shown)):
+            rising += 2 * np.isfinite(shown[c, PELVIS, 0])
     for i in range(rising):
         swept[n + i] = swept[i]
         swept[n + i, 2] -= _until(reach_s, table.horizon_s, table.sink_m)
@@ -204,50 +273,85 @@ def tube(
 
 
 @njit(cache=True)
-def _ends(limb: int, points: Floats, velocity: Floats, span_s: float, hand_m: float, swept: Floats) -> int:
+def _ends(
+    limb: int, points: Floats, shown: Floats, velocity: Floats, span_s: float, hand_m: float, swept: Floats
+) -> int:
     """Writes a limb's ends at the tick and after ``span_s``; returns the number of points; the pelvis's come first."""
-    n = 0
-    if limb == HEAD_LIMB:
-        n = _add(points[NECK], velocity[NECK], span_s, swept, n)
-        return _add(points[HEAD], velocity[HEAD], span_s, swept, n)
-    if limb == THORAX:
-        for k in (PELVIS, _ARMS[0, 0], _ARMS[1, 0]):
-            n = _add(points[k], velocity[k], span_s, swept, n)
-        return n
     if limb == LEGS:
-        n = _add(points[PELVIS], velocity[PELVIS], span_s, swept, n)
-        along = _STRIDE * velocity[PELVIS]
-        along[2] = 0.0  # feet stay on the floor
-        for k in LEG_POINTS:
-            if np.isfinite(points[k].sum()):
-                n = _add(points[k], along, span_s, swept, n)
-        if not np.isfinite(points[BENDS].sum()):  # around the line from the floor to the pelvis
-            below = points[PELVIS].copy()
-            below[2] = 0.0
-            n = _add(below, along, span_s, swept, n)
-        return n
-    return _arm(limb, points, velocity, span_s, hand_m, swept)
+        return _legs(points, shown, velocity, span_s, swept)
+    if limb not in (HEAD_LIMB, THORAX) and (limb - 2) % 2 == 1:
+        return _lower_arm(limb, points, shown, velocity, span_s, hand_m, swept)
+    n = 0
+    ends = _ENDS_OF[limb, : _ENDS[limb]]
+    for k in ends:
+        n = _add(points[k], velocity[k], span_s, swept, n)
+    for c in range(len(shown)):
+        for k in ends:
+            if np.isfinite(shown[c, k, 0]):
+                n = _add(shown[c, k], velocity[k], span_s, swept, n)
+    return n
 
 
 @njit(cache=True)
-def _arm(limb: int, points: Floats, velocity: Floats, span_s: float, hand_m: float, swept: Floats) -> int:
-    n = 0
+def _legs(points: Floats, shown: Floats, velocity: Floats, span_s: float, swept: Floats) -> int:
+    n = _add(points[PELVIS], velocity[PELVIS], span_s, swept, 0)
+    for c in range(len(shown)):
+        if np.isfinite(shown[c, PELVIS, 0]):
+            n = _add(shown[c, PELVIS], velocity[PELVIS], span_s, swept, n)
+    along = _STRIDE * velocity[PELVIS]
+    along[2] = 0.0  # feet stay on the floor
+    stood = along * (_LEGS_AGE_S / _STRIDE)
+    span_s += _LEGS_AGE_S
+    for k in LEG_POINTS:
+        if np.isfinite(points[k].sum()):
+            n = _add(points[k] - stood, along, span_s + _LEGS_AGE_S / _STRIDE, swept, n)
+        for c in range(len(shown)):
+            if np.isfinite(shown[c, k, 0]):
+                n = _add(shown[c, k] - stood, along, span_s + _LEGS_AGE_S / _STRIDE, swept, n)
+    if not np.isfinite(points[BENDS].sum()):  # around the line from the floor to the pelvis
+        below = points[PELVIS].copy()
+        below[2] = 0.0
+        n = _add(below, along, span_s, swept, n)
+    return n
+
+
+@njit(cache=True)
+def _lower_arm(
+    limb: int, points: Floats, shown: Floats, velocity: Floats, span_s: float, hand_m: float, swept: Floats
+) -> int:
+    """Writes the forearm with its hand; where a camera shows any of it elsewhere, also as that camera shows it."""
     arm = (limb - 2) // 2
-    shoulder, elbow, wrist = _ARMS[arm]
-    if (limb - 2) % 2 == 0:
-        n = _add(points[shoulder], velocity[shoulder], span_s, swept, n)
-        return _add(points[elbow], velocity[elbow], span_s, swept, n)
-    n = _add(points[elbow], velocity[elbow], span_s, swept, n)
-    n = _add(points[wrist], velocity[wrist], span_s, swept, n)
-    forearm = points[wrist] - points[elbow]
+    _, elbow, wrist = _ARMS[arm]
+    hand = HANDS[arm]
+    ends = np.empty((3, 3))
+    ends[0], ends[1], ends[2] = points[elbow], points[wrist], points[hand]
+    n = _add_arm(ends, velocity[elbow], velocity[wrist], span_s, hand_m, swept, 0)
+    for c in range(len(shown)):
+        elsewhere = False
+        for i, k in enumerate((elbow, wrist, hand)):
+            there = np.isfinite(shown[c, k, 0])
+            ends[i] = shown[c, k] if there else points[k]
+            elsewhere = elsewhere or there
+        if elsewhere:
+            n = _add_arm(ends, velocity[elbow], velocity[wrist], span_s, hand_m, swept, n)
+    return n
+
+
+@njit(cache=True)
+def _add_arm(ends: Floats, elbows: Floats, wrists: Floats, span_s: float, hand_m: float, swept: Floats, n: int) -> int:
+    """Writes elbow, wrist and hand (3, 3) [m], with the velocities (3,) of elbow and wrist [m/s]."""
+    elbow, wrist, hand = ends[0], ends[1], ends[2]
+    n = _add(elbow, elbows, span_s, swept, n)
+    n = _add(wrist, wrists, span_s, swept, n)
+    forearm = wrist - elbow
     length = np.sqrt((forearm**2).sum())
     if length > 0.0 and hand_m > 0.0:
-        turning = velocity[wrist] + (velocity[wrist] - velocity[elbow]) * (hand_m / length)
-        n = _add(points[wrist] + forearm * (hand_m / length), turning, span_s, swept, n)
-        bent = points[HANDS[arm]] - points[wrist]
+        turning = wrists + (wrists - elbows) * (hand_m / length)
+        n = _add(wrist + forearm * (hand_m / length), turning, span_s, swept, n)
+        bent = hand - wrist
         size = np.sqrt((bent**2).sum())
         if size > _SHORT_M:
-            n = _add(points[wrist] + bent * (hand_m / size), turning, span_s, swept, n)
+            n = _add(wrist + bent * (hand_m / size), turning, span_s, swept, n)
     return n
 
 

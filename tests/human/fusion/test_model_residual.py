@@ -102,6 +102,31 @@ class Samples:
         return float(self.sizes[order][np.searchsorted(share, settings.residual_quantile)])
 
 
+@dataclass
+class Shown:
+    """Where each camera showed a point beside the model, (camera, point) -> offset [m] and capture [ns]."""
+
+    places: dict[tuple[int, str], tuple[Floats, int]] = field(default_factory=dict)
+
+    def off_m(self, camera: int, point: str, there: Floats, model: Floats, placed: Floats, now_ns: int) -> float:
+        """From the line between the point as the filter has it and, up to 5 cm, as the camera showed it before."""
+        last, capture_ns = self.places.get((camera, point), (model * np.nan, 0))
+        along = model + last - placed
+        apart = float(np.linalg.norm(along))
+        if now_ns - capture_ns > 200_000_000 or not apart > 0.05:
+            return float(np.linalg.norm(there - placed))
+        unit = along / apart
+        at = np.clip((there - placed) @ unit, 0.0, apart - 0.05)
+        return float(np.linalg.norm(there - placed - at * unit))
+
+    def enter(self, m: Measurements, i: int, model: Floats, settings: Fusion) -> None:
+        for point in (*BESIDE, "pelvis"):
+            k, key = POINTS.index(point), (int(m.camera[i]), point)
+            newer = m.capture_ns[i] >= self.places.get(key, (None, 0))[1]
+            if newer and m.confidence[i, k] >= settings.confidence_min and np.isfinite(m.points_m[i, k]).all():
+                self.places[key] = (m.points_m[i, k] - model[k], int(m.capture_ns[i]))
+
+
 def plain_residual(m: Measurements, states: HumanStates, prior: HumanStates, settings: Fusion) -> tuple[Floats, Floats]:
     """(n, 6) without a gate for outliers, and (n, 20, 3) where the points are: every sample kept, the quantile exact.
 
@@ -109,7 +134,7 @@ def plain_residual(m: Measurements, states: HumanStates, prior: HumanStates, set
     """
     found, lately = np.full((len(states), 6), np.nan), np.zeros((len(states), 6))
     points, beside = skeleton(states.p, states.lengths_m), np.zeros((len(states), len(POINTS), 3))
-    samples, offsets = {limb: Samples() for limb in LIMBS}, {point: Offset() for point in BESIDE}
+    samples, offsets, by_camera = {limb: Samples() for limb in LIMBS}, {point: Offset() for point in BESIDE}, Shown()
     settled_s = {name: found_s(states, limb) + settings.memory_s for limb, name in enumerate(LIMBS)}
     torso = Rotation.from_euler("ZY", states.p[:, 2:4]).as_matrix()
     for k, i in used_frames(m, states.t_ns):
@@ -132,7 +157,10 @@ def plain_residual(m: Measurements, states: HumanStates, prior: HumanStates, set
             ):
                 continue
             shown.append(name)
-            sample = float(np.linalg.norm(placed[ends] - m.points_m[i, ends], axis=1).max())
+            sample = max(
+                by_camera.off_m(int(m.camera[i]), POINTS[a], m.points_m[i, a], model[a], placed[a], int(states.t_ns[k]))
+                for a in ends
+            )
             samples[name].enter(sample, now_s, settings)
             if sample >= lately[k, limb]:  # nothing larger is held
                 held = states.t_ns[k:] < states.t_ns[k] + round(settings.residual_hold_s * 1e9)
@@ -144,6 +172,7 @@ def plain_residual(m: Measurements, states: HumanStates, prior: HumanStates, set
                 a = POINTS.index(point)
                 offset.enter(turned.T @ (m.points_m[i, a] - model[a]), int(states.t_ns[k]), settings)
                 beside[k:, a] = offset.mean
+        by_camera.enter(m, i, model, settings)
     points += np.einsum("nij,nkj->nki", torso, beside)
     shoulders = points[:, index(("shoulder_l", "shoulder_r"))]
     points[:, POINTS.index("neck")] = shoulders.mean(axis=1)

@@ -31,7 +31,7 @@ LEGS = tuple(f"{part}_{side}" for part in ("hip", "knee", "ankle", "foot") for s
 
 
 def people(count: int, seed: int) -> HumanStates:
-    """Of any posture, beside the model, with bent hands, legs that are shown, and residuals."""
+    """Of any posture, beside the model, with bent hands, legs that are shown, residuals, and cameras that disagree."""
     rng, states = np.random.default_rng(seed), random_states(PEOPLE, count, seed)
     points = states.points_m + rng.normal(0.0, 0.05, states.points_m.shape)
     for side in "rl":
@@ -40,36 +40,56 @@ def people(count: int, seed: int) -> HumanStates:
         points[:, POINTS.index(f"hand_{side}")] = points[:, POINTS.index(f"wrist_{side}")] + bent
     for name in LEGS:
         points[:, POINTS.index(name)] = points[:, 0] + rng.uniform(-0.4, 0.4, (count, 3)) - [0.0, 0.0, 0.4]
-    return replace(states, points_m=points, residual_m=rng.uniform(0.0, 0.4, (count, len(BODY))))
+    cameras = np.where(rng.random((count, 2, len(POINTS), 1)) < 0.6, np.nan, points[:, None])
+    cameras = cameras + rng.normal(0.0, 0.2, cameras.shape)
+    residual = rng.uniform(0.0, 0.4, (count, len(BODY)))
+    return replace(states, points_m=points, camera_points_m=cameras, residual_m=residual)
+
+
+def velocities(states: HumanStates, tick: int) -> dict[str, Floats]:
+    """Of the model's points [m/s]."""
+    step, at = 1e-5, states.rows(slice(tick, tick + 1))
+    later, earlier = (skeleton(at.p + sign * step * at.v, at.lengths_m)[0] for sign in (1.0, -1.0))
+    return {name: (later[k] - earlier[k]) / (2.0 * step) for k, name in enumerate(POINTS)}
+
+
+def looks(states: HumanStates, tick: int, names: tuple[str, ...]) -> list[dict[str, Floats]]:
+    """The fused places of the points, then those of each camera that shows any of some elsewhere [m]."""
+    fused = {name: states.points_m[tick, k] for k, name in enumerate(POINTS)}
+    found = [fused]
+    for camera in [] if states.camera_points_m is None else states.camera_points_m[tick]:
+        there = {name: camera[POINTS.index(name)] for name in names if np.isfinite(camera[POINTS.index(name)]).all()}
+        if there:
+            found.append({**fused, **there})
+    return found
 
 
 def ends(states: HumanStates, tick: int, limb: str, departure: Departure, horizon_s: float) -> Floats:
     """(k, 3) the limb's ends at the tick and where they are carried, as high and as low as the body may be."""
-    step, at = 1e-5, states.rows(slice(tick, tick + 1))
-    later, earlier = (skeleton(at.p + sign * step * at.v, at.lengths_m)[0] for sign in (1.0, -1.0))
-    velocity = (later - earlier) / (2.0 * step)
-    place = {name: states.points_m[tick, k] for k, name in enumerate(POINTS)}
-    speed = {name: velocity[k] for k, name in enumerate(POINTS)}
-    if limb == "LEGS":
-        over = speed["pelvis"] * [2.0, 2.0, 0.0]
-        now = [place["pelvis"], *(place[name] for name in LEGS)]
-        going = [speed["pelvis"]] + [over] * len(LEGS)
-    else:
-        now, going = [place[name] for name in ENDS[limb]], [speed[name] for name in ENDS[limb]]
-    if limb in ("LRA", "LLA"):
-        elbow, wrist = now
-        hand = place[f"hand_{limb[1].lower()}"]
-        turning = going[1] + (going[1] - going[0]) * HAND_M / np.linalg.norm(wrist - elbow)
-        for along in (wrist - elbow, hand - wrist):
-            now.append(wrist + HAND_M * along / np.linalg.norm(along))
-            going.append(turning)
+    speed = velocities(states, tick)
     carried = 0.15 if "A" in limb else 0.25
     carried = min(horizon_s, carried + max(0.0, horizon_s - 0.377))
-    later = [p + v * carried for p, v in zip(now, going, strict=True)]
-    rising = [now[0], later[0]] if limb == "LEGS" else now + later
+    hand = f"hand_{limb[1].lower()}"
+    names = {"LEGS": ("pelvis", *LEGS)}.get(limb, ENDS.get(limb, ()) + ((hand,) if limb in ("LRA", "LLA") else ()))
+    still, rising = [], []
+    for place in looks(states, tick, names):
+        if limb == "LEGS":
+            over = speed["pelvis"] * [1.0, 1.0, 0.0]
+            rising += [place["pelvis"], place["pelvis"] + carried * speed["pelvis"]]
+            for name in LEGS:  # one stood since the frame 70 ms ago, the other one swings
+                still += [place[name] - 0.07 * over, place[name] + 2.0 * (carried + 0.07) * over]
+            continue
+        now, going = [place[name] for name in ENDS[limb]], [speed[name] for name in ENDS[limb]]
+        if limb in ("LRA", "LLA"):
+            elbow, wrist = now
+            turning = going[1] + (going[1] - going[0]) * HAND_M / np.linalg.norm(wrist - elbow)
+            for along in (wrist - elbow, place[hand] - wrist):
+                now.append(wrist + HAND_M * along / np.linalg.norm(along))
+                going.append(turning)
+        rising += now + [p + v * carried for p, v in zip(now, going, strict=True)]
     rise, sink = (at_horizon(departure, row, horizon_s) for row in (departure.rise_m, departure.sink_m))
     high, low = ([p + np.array([0.0, 0.0, by]) for p in rising] for by in (rise, -sink))
-    return np.array(now + later + high + low)
+    return np.array(still + rising + high + low)
 
 
 def at_horizon(departure: Departure, row: Floats, horizon_s: float) -> float:
@@ -79,11 +99,19 @@ def at_horizon(departure: Departure, row: Floats, horizon_s: float) -> float:
     return float(np.interp(horizon_s, long, row))
 
 
-def allowed_m(departure: Departure, limb: str, horizon_s: float, residual_m: float) -> float:
+def allowed_m(departure: Departure, limb: str, horizon_s: float, residual_m: float, speed: float) -> float:
     k = BODY.index(limb)
-    beyond = at_horizon(departure, departure.beyond_m[k], horizon_s)
+    assert departure.swings_s is not None
+    beyond, swings = (at_horizon(departure, row[k], horizon_s) for row in (departure.beyond_m, departure.swings_s))
     times = np.interp(horizon_s, departure.horizon_s, departure.residuals[k])
-    return float(max(residual_m, beyond + times * min(residual_m, NOISE_M) + max(residual_m - NOISE_M, 0.0)))
+    now = times * min(residual_m, NOISE_M) + max(residual_m - NOISE_M, 0.0)
+    return float(max(residual_m, now + beyond + min(speed, 1.0) * swings))
+
+
+def speed_of(states: HumanStates, tick: int, limb: str) -> float:
+    """Of the fastest end of a limb, of legs that of the pelvis [m/s]."""
+    found = velocities(states, tick)
+    return max(float(np.linalg.norm(found[name])) for name in ENDS.get(limb, ("pelvis",)))
 
 
 def distance_m(point: Floats, vertices: Floats) -> float:
@@ -105,7 +133,7 @@ def test_who_keeps_to_the_departures_is_inside_and_nobody_much_further(horizon_s
         for k, limb in enumerate(BODY):
             base = ends(states, tick, limb, PEOPLE.departure, horizon_s)
             residual = states.residual_m[tick, BODY.index("THX") if limb == "LEGS" else k]
-            reach = allowed_m(PEOPLE.departure, limb, horizon_s, residual)
+            reach = allowed_m(PEOPLE.departure, limb, horizon_s, residual, speed_of(states, tick, limb))
             radius = volumes.radius_m[tick, k] - FLESH_M[limb]
             assert radius == pytest.approx(reach, abs=2e-9)
             out = rng.normal(size=(50, 3))
@@ -156,7 +184,7 @@ def test_a_limb_that_is_out_of_sight_has_the_volume_of_its_joints() -> None:
     ],
 )
 def test_what_an_unseen_limb_carries_has_no_tube_either(hidden: str, gone: set[str]) -> None:
-    states = people(2, seed=11)
+    states = replace(people(2, seed=11), camera_points_m=None)  # otherwise what is seen bounds them
     unseen = states.unseen_s.copy()
     unseen[:, LIMBS.index(hidden)] = MEMORY_S + 0.5
     states = replace(states, unseen_s=unseen)
@@ -177,7 +205,7 @@ def test_a_limb_seen_a_while_ago_may_have_departed_for_longer() -> None:
     assert PEOPLE.departure is not None
     k = BODY.index("ULA")
     for tick in range(3):
-        reach = allowed_m(PEOPLE.departure, "ULA", 0.3, states.residual_m[tick, k])
+        reach = allowed_m(PEOPLE.departure, "ULA", 0.3, states.residual_m[tick, k], speed_of(states, tick, "ULA"))
         assert late.radius_m[tick, k] == pytest.approx(FLESH_M["ULA"] + reach, abs=2e-9)
     assert (late.radius_m[:, k] > early.radius_m[:, k]).all()
 
@@ -189,7 +217,13 @@ def test_legs_that_were_hidden_just_now_may_have_departed_for_longer() -> None:
     late = predict(replace(states, unseen_s=unseen), PEOPLE, Prediction(), horizon_s=0.1, memory_s=MEMORY_S)
     assert PEOPLE.departure is not None
     for tick in range(3):
-        reach = allowed_m(PEOPLE.departure, "LEGS", 0.18, states.residual_m[tick, BODY.index("THX")])
+        reach = allowed_m(
+            PEOPLE.departure,
+            "LEGS",
+            0.18,
+            states.residual_m[tick, BODY.index("THX")],
+            speed_of(states, tick, "LEGS"),
+        )
         assert late.radius_m[tick, k] == pytest.approx(FLESH_M["LEGS"] + reach, abs=2e-9)
 
 
@@ -208,9 +242,9 @@ def test_hidden_legs_are_the_line_below_the_pelvis_as_thick_as_they_were(gone: t
         line = np.linspace([pelvis[0], pelvis[1], 0.0], pelvis, 5)
         shown = [points[tick, POINTS.index(name)] for name in LEGS if name not in gone]
         assert max(distance_m(point, volumes.vertices(tick, k)) for point in [*line, *shown]) < 1e-5
-        reach = allowed_m(PEOPLE.departure, "LEGS", 0.1, states.residual_m[tick, BODY.index("THX")])
+        reach = allowed_m(PEOPLE.departure, "LEGS", 0.1, states.residual_m[tick, BODY.index("THX")], 0.0)
         bent = np.sqrt(max(0.0, 0.47**2 - (0.5 * states.p[tick, 12]) ** 2))
-        thick = max(0.20, bent + 0.08, states.residual_m[tick, k] + 0.08)
+        thick = max(0.20 + 0.06, bent + 0.08 + 0.06, states.residual_m[tick, k] + 0.08)
         assert volumes.radius_m[tick, k] == pytest.approx(thick + reach, abs=2e-9)
 
 
@@ -227,7 +261,8 @@ def test_a_hidden_foot_or_hip_makes_legs_no_thicker() -> None:
 
 def test_nobody_known_has_no_tube() -> None:
     states = people(2, seed=9)
-    nobody = replace(states, p=np.full_like(states.p, np.nan), points_m=np.full_like(states.points_m, np.nan))
+    unknown = {name: np.full_like(getattr(states, name), np.nan) for name in ("p", "points_m", "camera_points_m")}
+    nobody = replace(states, **unknown)
     volumes = predict(nobody, PEOPLE, Prediction(), horizon_s=0.1, memory_s=MEMORY_S)
     assert all(np.isnan(volumes.vertices(tick, k)).all() for tick in range(2) for k in range(len(BODY)))
 

@@ -10,7 +10,16 @@ from typing import Any
 
 from hrcreplay import limits
 from hrcreplay.reporting.tables import share_text
-from tests.tools.readme.measurements import BASELINES, HORIZONS_MS, MARGINS, PLACES, RECORDINGS, VARIANTS, Figures
+from tests.tools.readme.measurements import (
+    BASELINES,
+    HORIZONS_MS,
+    MARGINS,
+    ORACLED,
+    PLACES,
+    RECORDINGS,
+    VARIANTS,
+    Figures,
+)
 
 Facts = Mapping[str, Any]
 Row = Iterable[str]
@@ -144,19 +153,68 @@ def recordings(facts: Facts) -> str:
 
 
 def people(facts: Facts) -> str:
-    """What each recording, left out of the fit once, gave: from the limit set itself, which ``make people`` makes."""
-    found = tomllib.loads(PEOPLE.read_text())["provenance"]["departures"]
+    """What each tracker and person, left out of the fit, gave: from the limit set, which ``make people`` makes."""
+    found = _departures()
     until = [f"{1000 * horizon_s:.0f} ms" for horizon_s in found["horizon_s"]]
     beside = {"union_without_legs_m3": "no legs", "capsules_m3": "capsules", "fitted_to_it_m3": "fitted to it"}
     head = ["left out", *until, *(f"{title}, {until[-1]}" for title in beside.values())]
     rows = []
-    for log in found["logs"]:
-        shares = zip(log["shares"], log["union_m3"], strict=True)
-        cells = [f"{_share(part['share'])}, {_m3(size)}" for part, size in shares]
-        rows.append([log["name"].rsplit(".", 1)[0], *cells, *(_m3(log[name][-1]) for name in beside)])
+    for group in found["groups"]:
+        own = [log for log in found["logs"] if log["group"] == group["name"]]
+        told = ", not fitted" if group["name"] in found["not_fitted"] else ""
+        rows.append([f"**{group['name']}{told}**", *_shares(group), *[""] * len(beside)])
+        if len(own) > 1:
+            names = [log["name"].rsplit(".", 1)[0] for log in own]
+            sizes = [[_m3(log[name][-1]) for name in beside] for log in own]
+            rows += [[name, *_shares(log), *size] for name, log, size in zip(names, own, sizes, strict=True)]
+        else:
+            rows[-1][-len(beside) :] = [_m3(own[0][name][-1]) for name in beside]
     pooled = [f"{_share(one['share'])} ({_share(one['low'])} to {_share(one['high'])})" for one in found["unknown"]]
     together = "recordings together, demo and simulated people not (95 % interval)"
-    return _table(head, [*rows, [together, *pooled, *[""] * len(beside)]])
+    rest = [share for limb in found["of_recordings"]["at_rest"].values() for share in limb]
+    widened = ", ".join(f"{factor:g}" for factor in found["widened"])
+    words = (
+        f"For people who were not there all lines are wider than the fit by the factors {widened}, one a horizon. "
+        f"Of the bounds on limbs at rest the recordings without ground truth alone give {_share(min(rest))} to "
+        f"{_share(max(rest))}, {_share(sum(rest) / len(rest))} in the mean; the rest comes from simulated people."
+    )
+    return f"{_table(head, [*rows, [together, *pooled, *[''] * len(beside)]])}\n\n{_wrapped(words)}"
+
+
+def misses(facts: Facts) -> str:
+    """The limbs that left at horizons at which a recording is inside too rarely, tick by tick, by the limb."""
+    found, rows = _departures(), []
+    for log in found["logs"]:
+        each: dict[tuple[str, float], list[dict[str, Any]]] = {}
+        for one in log["misses"]:
+            each.setdefault((one["limb"], one["horizon_s"]), []).append(one)
+        for (limb, horizon_s), own in each.items():
+            at = " ".join(f"{one['at_s']:.2f}" for one in own)
+            far, fast = ([one[name] for one in own] for name in ("departed_m", "m_per_s"))
+            until = f"{1000 * horizon_s:.0f} ms"
+            size, speed = (f"{min(of):.{digits}f} to {max(of):.{digits}f}" for of, digits in ((far, 2), (fast, 1)))
+            rows.append([log["name"].rsplit(".", 1)[0], until, f"`{limb}`", size, speed, at])
+    return _table(["recording", "horizon", "limb", "departed, m", "over the horizon, m/s", "at, s"], rows)
+
+
+def oracle(facts: Facts) -> str:
+    """Pace of a controller that knows the recorded future beside qp's."""
+    of, rows = _of(facts, "oracle"), []
+    for name in ORACLED:
+        cells = [_share(of[f"{name} {who}_{what}"]) for what in ("pace", "standing") for who in ("qp", "oracle")]
+        rows.append([name, *cells, f"{of[f'{name} near_ticks']:,}"])
+    head = ["recording", *(f"{what}, `{who}`" for what in ("pace", "standing") for who in ("qp", "oracle"))]
+    return _table([*head, "near ticks"], rows)
+
+
+def _departures() -> dict[str, Any]:
+    return dict(tomllib.loads(PEOPLE.read_text())["provenance"]["departures"])
+
+
+def _shares(of: Mapping[str, Any]) -> list[str]:
+    """Share and volume at each horizon."""
+    parts = zip(of["shares"], of["union_m3"], strict=True)
+    return [f"{_share(part['share'])}, {_m3(size)}" for part, size in parts]
 
 
 def margins(facts: Facts) -> str:
@@ -193,6 +251,8 @@ BLOCKS: dict[str, Callable[[Facts], str]] = {
     "soundness": soundness,
     "recordings": recordings,
     "people": people,
+    "misses": misses,
+    "oracle": oracle,
     "margins": margins,
 }
 

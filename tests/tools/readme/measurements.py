@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import product
@@ -72,6 +73,9 @@ SAMPLES = {
     ("positions", "people"): 200_000,
     ("positions", "paper"): 200_000,
 }
+#: What measures the pace of a controller that knows the future, on recordings by others, too.
+ORACLE = "tests.tools.oracle"
+ORACLED = ("demo", "azure walking", "azure moving", "kinect 2 lines", "kinect 2 sitting", "exp_box")
 #: Recordings by others: name in the README -> name in tests/test_recordings.py, or the bag.
 RECORDINGS = {
     "Azure Kinect, walking": "azure walking",
@@ -101,7 +105,7 @@ class Measurement:
     @property
     def needs_data(self) -> bool:
         """Whether it needs recordings by others."""
-        return any("{data}" in command for command in self.commands)
+        return any("{data}" in command or command.startswith(ORACLE) for command in self.commands)
 
 
 def of_report(metrics: Mapping[str, Any]) -> Figures:
@@ -136,6 +140,11 @@ def of_sampling(found: Mapping[str, Any]) -> Figures:
     return {name: found[name] for name in ("samples", "states", "states_let_out", "share", "worst_mm")}
 
 
+def of_oracle(found: Mapping[str, Any]) -> Figures:
+    """What is kept of both controllers, recording by recording."""
+    return {f"{name} {key}": value for name in ORACLED for key, value in found[name].items()}
+
+
 def measurements() -> list[Measurement]:
     """All of them, the quick ones first."""
     found = [_audit("audit demo", (DEMO,), {})]
@@ -150,6 +159,7 @@ def measurements() -> list[Measurement]:
     command = f"hrcreplay compare {DEMO} --out {{tmp}}/run"
     found.append(Measurement("compare", (command,), "run/compare.json", of_comparison, {}))
     found += [_recording(name, key) for name, key in RECORDINGS.items()]
+    found.append(Measurement("oracle", (f"{ORACLE} --json {shlex.join(ORACLED)}",), "", of_oracle, {}))
     for (method, limits), samples in sorted(SAMPLES.items(), key=lambda item: item[1]):
         command = f"tests.tools.soundness --json --samples {samples} --method {method} --limits {limits}"
         found.append(Measurement(f"soundness, {method}, {limits}", (command,), "", of_sampling, {}, sampled=True))

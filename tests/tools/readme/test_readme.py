@@ -16,6 +16,7 @@ from hrcreplay.cli.app import app
 from hrcreplay.commands import replay, report
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import Run
+from tests.tools import oracle
 from tests.tools.readme import __main__ as readme
 from tests.tools.readme.blocks import BLOCK, BLOCKS, fill
 from tests.tools.readme.measurements import (
@@ -23,6 +24,7 @@ from tests.tools.readme.measurements import (
     COMPARED,
     DEMO,
     HORIZONS_MS,
+    ORACLED,
     ROOT,
     VARIANTS,
     Measurement,
@@ -90,6 +92,8 @@ def test_the_commands_parse(measurement: Measurement) -> None:
         module, *words = shlex.split(command.format(tmp="tmp", data="data"))
         if module == "hrcreplay":
             commands.commands[words[0]].make_context(words[0], words[1:])
+        elif module == "tests.tools.oracle":
+            assert oracle.parser().parse_args(words).names == [*ORACLED]
         else:
             assert module == "tests.tools.soundness"
             soundness._parser().parse_args(words)
@@ -100,13 +104,19 @@ def _made_up() -> dict[str, Any]:
     numbers = iter(np.linspace(0.1, 0.9, 2000).tolist())
     facts: dict[str, Any] = {}
     for measurement in measurements():
-        found = measurement.keep(_Numbers(numbers) if measurement.name != "compare" else _compared(numbers))
+        made = {"compare": _compared, "oracle": _oracled}.get(measurement.name, _Numbers)
+        found = measurement.keep(made(numbers))
         facts[measurement.name] = {"figures": dict(found)}
     return facts
 
 
 def _compared(numbers: Any) -> dict[str, Any]:
     return {"total": {name: {key: next(numbers) for key in COMPARED} for name in VARIANTS}}
+
+
+def _oracled(numbers: Any) -> dict[str, Any]:
+    keys = [f"{who}_{what}" for who in ("qp", "oracle") for what in ("pace", "standing")]
+    return {name: {**{key: next(numbers) for key in keys}, "near_ticks": 1} for name in ORACLED}
 
 
 AUDIT_KEYS = [
