@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import signal
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -53,6 +54,12 @@ def group_of(nodeid: str) -> str:
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Adds ``--quick``."""
     parser.addoption("--quick", action="store_true", help="only the quick tests, tests/conftest.py QUICK")
+
+
+def pytest_configure() -> None:
+    """Lets sessions that tests start hear Ctrl-C: a shell that runs pytest in the background ignores it for all."""
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.hookimpl(optionalhook=True)
