@@ -42,14 +42,14 @@ _BONE_M = 0.02
 _VIEW_DEPTH_M = 0.35
 #: A message: topic, instant [ns], and content.
 Message = tuple[str, int, Any]
-#: Numbers of a method over time, for plots.
+#: Numbers of a method over time, for plots. One type for each: Foxglove Studio refuses a choice of types.
 _SERIES = ("tcp_speed", "ref_speed", "distance_m", "body_m", "horizon_s")
 _SERIES_SCHEMA = {
     "type": "object",
     "properties": {
-        **{name: {"type": ["number", "null"]} for name in _SERIES},
+        **{name: {"type": "number"} for name in _SERIES},
         **{name: {"type": "string"} for name in ("status", "reason", "limb", "link")},
-        "certified": {"type": ["boolean", "null"]},
+        "certified": {"type": "boolean"},
     },
 }
 
@@ -347,15 +347,16 @@ def _distances(scene: ReplayScene) -> Iterator[Message]:
 
 
 def _series(scene: ReplayScene, name: str, track: MethodTrack) -> Iterator[Message]:
-    """Yields the numbers of a method as JSON, null if unknown."""
+    """Yields the numbers of a method as JSON, without those that are unknown."""
     topic = f"{_base(scene, name)}/series"
     table = {key: np.round(getattr(track, key), 4).tolist() for key in _SERIES}
     texts = {kind: [known[i] if i >= 0 else "" for i in index.tolist()] for kind, (known, index) in track.names.items()}
     certified = track.certified.tolist()
     for i, t_ns in enumerate(scene.t_ns.tolist()):
-        row: dict[str, Any] = {key: values[i] if math.isfinite(values[i]) else None for key, values in table.items()}
+        row: dict[str, Any] = {key: values[i] for key, values in table.items() if math.isfinite(values[i])}
         row |= {kind: words[i] for kind, words in texts.items()}
-        row["certified"] = None if certified[i] < 0 else bool(certified[i])
+        if certified[i] >= 0:
+            row["certified"] = bool(certified[i])
         yield topic, t_ns, json.dumps(row, sort_keys=True, separators=(",", ":")).encode()
 
 

@@ -125,11 +125,29 @@ def test_numbers_over_time_are_those_of_the_record(
 ) -> None:
     track = scene.methods["scaling"]
     rows = [row for _, row in topics["/baseline/scaling/series"]]
-    assert rows[5]["distance_m"] is None  # nobody is known yet
+    assert "distance_m" not in rows[5]  # nobody is known yet
     np.testing.assert_allclose([row["tcp_speed"] for row in rows], track.tcp_speed, atol=0.51e-4)
     known, index = track.names["status"]
     assert [row["status"] for row in rows] == [known[i] for i in index.tolist()]
     assert all(row["certified"] is True for row in rows)
+
+
+def test_each_number_over_time_has_the_one_type_of_its_schema(
+    file: Path, topics: dict[str, list[tuple[int, Any]]]
+) -> None:
+    """Foxglove Studio refuses a whole topic if a type is not a single word: its plots are empty."""
+    with file.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    (text,) = {one.data for one in summary.schemas.values() if one.encoding == "jsonschema"}
+    types = {name: field["type"] for name, field in json.loads(text)["properties"].items()}
+    python = {"number": (int, float), "string": (str,), "boolean": (bool,)}
+    rows = [row for topic, found in topics.items() if topic.endswith("/series") for _, row in found]
+    assert {name for row in rows for name in row} == types.keys()
+    for row in rows:
+        for name, value in row.items():
+            assert type(value) in python[types[name]], (name, value)
+            assert types[name] != "number" or np.isfinite(value), name  # JSON has no NaN
 
 
 def test_a_volume_is_drawn_on_hull_and_ball(topics: dict[str, list[tuple[int, Any]]], scene: ReplayScene) -> None:
@@ -187,14 +205,16 @@ def test_the_layout_shows_topics_that_there_are(topics: dict[str, list[tuple[int
     layout = json.loads(LAYOUT.read_text())
     shown = layout["configById"]["3D!scene"]["topics"]
     assert set(shown) - {"/objects", "/cameras", "/watched"} <= topics.keys()  # these only where a cell has them
+    transforms = layout["configById"]["3D!scene"]["scene"]["transforms"]  # else axes, and lines to their parents
+    assert (transforms["axisScale"], transforms["lineWidth"]) == (0, 0)
     layer = layout["configById"]["3D!scene"]["layers"]["robot"]
     assert {layer["topic"], layer["jointStatesTopic"]} <= topics.keys()
     assert "base" in [one.child_frame_id for one in topics["/tf"][0][1].transforms]
     paths = [path["value"] for panel in layout["configById"].values() for path in panel.get("paths", ())]
     assert len(paths) > 4
-    row = topics["/plan/series"][0][1]
+    told = {name for _, row in topics["/plan/series"] for name in row}
     assert {path.partition(".")[0] for path in paths} == {"/plan/series"}
-    assert {path.partition(".")[2] for path in paths} <= row.keys()
+    assert {path.partition(".")[2] for path in paths} <= told
 
 
 def test_objects_are_closed_surfaces_around_their_hulls(scene: ReplayScene, tmp_path: Path) -> None:
