@@ -313,9 +313,18 @@ def _answer(
     def numbers(some: Sequence[int]) -> str:
         return ", ".join(str(number + 1) for number in some)
 
-    words = "Each of these keeps more pace than any setting that stayed further from people, over all logs."
-    touched = [number for number, total in enumerate(totals) if total["touch_ticks"]]
-    words += f"\nThe moving robot touched somebody with the settings {numbers(touched)}." if touched else ""
+    recorded = _against(totals)[0] is _NEAREST
+    far = "the recorded people" if recorded else "the predicted volumes"
+    words = f"Each of these keeps more pace than any setting whose moving robot stayed further from {far}."
+    if recorded:
+        ticks, known = (sum(total[name] or 0 for total in totals) for name in ("ticks", "known_ticks"))
+        words += (
+            f"\nThe recorded people were known at {known:,} of {ticks:,} ticks; contact at the others is not known."
+        )
+        touched = [number for number, total in enumerate(totals) if total["touch_ticks"]]
+        words += f"\nThe moving robot touched somebody with the settings {numbers(touched)}." if touched else ""
+    else:
+        words += "\nRuns of plan do not compare the robot with the recorded people: contact was not looked at."
     lacking = _lacking(rows)
     words += f"\nNot compared, as they lack a log that others have: settings {numbers(lacking)}." if lacking else ""
     named = [f"{number + 1} ({', '.join(f'{k} = {v}' for k, v in settings[number].items())})" for number in front]

@@ -88,12 +88,14 @@ def test_a_setting_that_lacks_the_hardest_log_is_not_on_the_front() -> None:
             for setting in (0, 1):
                 lacks = log == "broken" or missing == (log, setting)
                 given = {**dict.fromkeys(field.name for field in sweep_report.FIELDS), "touch_ticks": 0}
-                given |= {"pace": pace[setting], "nearest_moving_m": 0.1 + 0.1 * setting}
+                given |= {"ticks": 10, "known_ticks": 9, "pace": pace[setting], "nearest_moving_m": 0.1 + 0.1 * setting}
                 rows.append(SweepRow(log, setting, f"{log}/{setting}", None if lacks else given, None, "bad" * lacks))
         totals = [  # as means over the logs that are there
             {
                 **dict.fromkeys(field.name for field in sweep_report.FIELDS),
                 "touch_ticks": 0,
+                "ticks": 20,
+                "known_ticks": 18,
                 "pace": float(np.mean([row.figures["pace"] for row in rows if row.setting == n and row.figures])),
                 "nearest_moving_m": 0.1 + 0.1 * n,
             }
@@ -103,6 +105,8 @@ def test_a_setting_that_lacks_the_hardest_log_is_not_on_the_front() -> None:
         assert front == best
         page = sweep_report.render(rows, [{"plan.method": "qp"}, {"plan.method": "ssm"}], totals, front, "<svg></svg>")
         assert ("lack a log" in page) == (missing == ("hard", 0))
+        assert "known at 36 of 40 ticks" in page
+        assert "touched somebody" not in page
 
 
 @pytest.fixture(scope="module")
@@ -141,7 +145,9 @@ def test_runs_equal_single_runs_and_failed_ones_stop_nothing(single: dict[str, A
         *(("all", method, False) for method in single),
     ]
     assert rows[2]["pace"] == rows[4]["pace"] != ""
-    assert "plan.method=qp" in (out / "sweep.html").read_text()
+    page = (out / "sweep.html").read_text()
+    assert "plan.method=qp" in page
+    assert "contact was not looked at" in page, "these are runs of plan"
     made = {path: path.stat().st_mtime_ns for path in (out / RUNS).rglob("run.json")}
     again = sweep.run([str(broken), LOG], grid=GRID, command="plan", out=str(out), workers=1, **SPAN)
     assert set(again.failed) == set(found.failed)
