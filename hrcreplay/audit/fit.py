@@ -271,19 +271,8 @@ def _departures(
 ) -> tuple[Departure, dict[str, Any], str]:
     """Returns the departures fitted to all logs, the coverage by them and by fits without a group, and the misses."""
     apart = len(set(groups) - set(checked)) > 1
-    if apart:
-        known = [sample.limbs for sample in samples]
-        named = [(name, _settled(of)) for name, of in zip(groups, known, strict=True) if name not in checked]
-        fitted = [of for _, of in named]
-        others = {name: [of for own, of in named if own != name] for name in groups}
-        each = {name: fit_departures(rest, coverage) for name, rest in others.items()}
-        left_out = [(own, of, each[own]) for own, of in zip(groups, known, strict=True) if own not in checked]
-        factors = _factors(left_out, None, coverage)
-        folds = [widen(each[name], _factors(left_out, name, coverage)) for name in groups]
-    else:
-        parts = [_parts(sample) for sample in samples]
-        fitted, known = [_settled(first) for first, _ in parts], [last for _, last in parts]
-        folds, factors = [fit_departures(fitted, coverage)] * len(known), np.ones(1)
+    divided = _leave_out_groups(samples, coverage, groups, checked) if apart else _hold_back(samples, coverage)
+    fitted, known, folds, factors = divided
     found = widen(fit_departures(fitted, coverage), factors)
     horizons = range(len(found.horizon_s))
     inside = [[one.inside(fold, k) for k in horizons] for one, fold in zip(known, folds, strict=True)]
@@ -330,6 +319,35 @@ def _departures(
         "logs": logs,
     }
     return found, facts, _missed(facts, coverage)
+
+
+class _Division(NamedTuple):
+    """What is fitted, and what is judged by fits that have not seen it."""
+
+    fitted: list[LimbDepartures]
+    known: list[LimbDepartures]  #: judged, one per log
+    folds: list[Departure]  #: the fit that judges each of them
+    factors: Floats  #: by which the fit to all is wider, one a horizon or one for all
+
+
+def _leave_out_groups(
+    samples: Sequence[FitSample], coverage: float, groups: Sequence[str], checked: Sequence[str]
+) -> _Division:
+    """Divides logs by trackers and persons: each of these is judged by a fit to the others."""
+    known = [sample.limbs for sample in samples]
+    named = [(name, _settled(of)) for name, of in zip(groups, known, strict=True) if name not in checked]
+    others = {name: [of for own, of in named if own != name] for name in groups}
+    each = {name: fit_departures(rest, coverage) for name, rest in others.items()}
+    left_out = [(own, of, each[own]) for own, of in zip(groups, known, strict=True) if own not in checked]
+    folds = [widen(each[name], _factors(left_out, name, coverage)) for name in groups]
+    return _Division([of for _, of in named], known, folds, _factors(left_out, None, coverage))
+
+
+def _hold_back(samples: Sequence[FitSample], coverage: float) -> _Division:
+    """Divides each log in time: its end is judged by a fit to the beginnings."""
+    parts = [_parts(sample) for sample in samples]
+    fitted, known = [_settled(first) for first, _ in parts], [last for _, last in parts]
+    return _Division(fitted, known, [fit_departures(fitted, coverage)] * len(known), np.ones(1))
 
 
 def _factors(left_out: Sequence[tuple[str, LimbDepartures, Departure]], group: str | None, coverage: float) -> Floats:

@@ -190,11 +190,16 @@ def fuse(
         cameras=measurements.cameras,
         camera_points_m=track.camera_points,
     )
+    trace = Trace(track.cov, track.damping, track.spread, track.autocorrelation)
+    return after, states, _count_events(track, measurements.cameras), trace
+
+
+def _count_events(track: Track, cameras: Sequence[str]) -> Counter[str]:
     counts = Counter({"joints_reacquired": int(track.reacquired[0]), "ticks_saturated": int(track.saturated[0])})
-    for c, camera in enumerate(measurements.cameras):
+    for c, camera in enumerate(cameras):
         counts[f"outlier_points_{camera}"] = int(track.outliers[c])
         counts[f"superseded_frames_{camera}"] = int(track.superseded[c])
-    return after, states, counts, Trace(track.cov, track.damping, track.spread, track.autocorrelation)
+    return counts
 
 
 def process_noise(settings: Fusion, j: int, dt: float, damping: float) -> Floats:
