@@ -33,10 +33,10 @@ from hrcreplay.logs.reader import Log
 from hrcreplay.logs.reader import open_log as read_log
 from hrcreplay.logs.writer import LogWriter
 from hrcreplay.pipeline import assembly, reuse, stages
-from hrcreplay.pipeline.assembly import Forecast
 from hrcreplay.pipeline.person_fuser import PersonFuser
 from hrcreplay.pipeline.run_config import RunConfig, resolve
 from hrcreplay.pipeline.stages import Sink, Told, collect_fusion_findings, collect_plan_findings
+from hrcreplay.pipeline.surroundings import Forecast, Surroundings
 from hrcreplay.records import CameraFrames, Floats, HumanStates, Ints, Motion, SweptVolumes
 from hrcreplay.robot.control.controllers import Planner
 from hrcreplay.robot.task import parse_task
@@ -428,7 +428,7 @@ class Controller:
         """Starts at the beginning of the programme; the arguments are those of ``plan``."""
         self._run_config = _planned(recording.run_config, robot, task, method, ())
         self._log = recording.log
-        self._started: tuple[Planner, assembly.Surroundings] | None = None
+        self._started: tuple[Planner, Surroundings] | None = None
 
     def step(self, person: HumanStates) -> Motion:
         """Computes the robot's motion at a tick, one row.

@@ -21,7 +21,7 @@ from hrcreplay.geometry.inflated_hull import InflatedHull, union_volume_m3
 from hrcreplay.human.model import Departure
 from hrcreplay.human.prediction.swept_volumes import limb_radii
 from hrcreplay.human.prediction.velocity_tube import LEGS, NOISE_M, THORAX, limb_speeds, tubes
-from hrcreplay.pipeline.assembly import PredictionStage
+from hrcreplay.pipeline.surroundings import PredictionStage
 from hrcreplay.records import BODY, LIMBS, Bools, Floats, HumanStates, Ints, SweptVolumes
 
 #: Measured horizons; robots near people stop within about 10 to 100 ms, and below the first horizon nothing is known

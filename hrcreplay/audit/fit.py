@@ -27,11 +27,11 @@ from hrcreplay.human.prediction.velocity_tube import FASTEST_M_PER_S
 from hrcreplay.limits import load_limits, write_limits
 from hrcreplay.logs.reader import open_log
 from hrcreplay.pipeline import assembly
-from hrcreplay.pipeline.assembly import PredictionStage
 from hrcreplay.pipeline.kernel_build import ensure_compiled
 from hrcreplay.pipeline.progress import ProgressBar
 from hrcreplay.pipeline.run_config import RunConfig, RunOptions, resolve
 from hrcreplay.pipeline.stages import NS, span_ns, tick_times
+from hrcreplay.pipeline.surroundings import PredictionStage
 from hrcreplay.records import BODY, JOINTS, Floats
 from hrcreplay.reporting.tables import share_text
 from hrcreplay.version import __version__

@@ -27,10 +27,10 @@ from hrcreplay.human.prediction import swept_volumes
 from hrcreplay.human.prediction.swept_volumes import Reach, limb_radii
 from hrcreplay.logs.reader import open_log
 from hrcreplay.pipeline import assembly
-from hrcreplay.pipeline.assembly import PredictionStage
 from hrcreplay.pipeline.progress import ProgressBar
 from hrcreplay.pipeline.run_config import RunConfig
 from hrcreplay.pipeline.stages import NS, span_ns, tick_times
+from hrcreplay.pipeline.surroundings import PredictionStage
 from hrcreplay.records import DOF, JOINTS, Floats, HumanStates, Ints, SweptVolumes
 from hrcreplay.reporting.metrics.series import ANGLES, difference
 from hrcreplay.store.run_folder import Stopwatch

@@ -45,10 +45,10 @@ from hrcreplay.evaluation.recorded_person import TRUTH
 from hrcreplay.human.prediction import swept_volumes
 from hrcreplay.human.prediction.swept_volumes import limb_radii
 from hrcreplay.pipeline import assembly
-from hrcreplay.pipeline.assembly import PredictionStage
 from hrcreplay.pipeline.kernel_build import ensure_compiled
 from hrcreplay.pipeline.progress import print_note
 from hrcreplay.pipeline.run_config import RunConfig, RunOptions, resolve
+from hrcreplay.pipeline.surroundings import PredictionStage
 from hrcreplay.reporting.tables import percent
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import RunWriter, Stopwatch

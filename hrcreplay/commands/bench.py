@@ -28,11 +28,11 @@ from scipy.spatial import ConvexHull
 from hrcreplay.errors import SettingsError
 from hrcreplay.logs.reader import open_log
 from hrcreplay.pipeline import assembly, stages
-from hrcreplay.pipeline.assembly import Forecast
 from hrcreplay.pipeline.kernel_build import ensure_compiled
 from hrcreplay.pipeline.progress import NO_PROGRESS, Progress
 from hrcreplay.pipeline.run_config import RunConfig, RunOptions, resolve
 from hrcreplay.pipeline.stages import Sink
+from hrcreplay.pipeline.surroundings import Forecast
 from hrcreplay.records import DOF, JOINTS, LENGTHS, Floats, HumanStates, Ints
 from hrcreplay.robot.control.separation import Obstacles
 from hrcreplay.robot.model import RobotModel

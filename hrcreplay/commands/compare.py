@@ -34,13 +34,14 @@ from hrcreplay.evaluation.recorded_person import RecordedPeople
 from hrcreplay.evaluation.severity import severity_table
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.pipeline import assembly, reuse, stages
-from hrcreplay.pipeline.assembly import Follower, Forecast, Recorded
+from hrcreplay.pipeline.assembly import Follower, Recorded
 from hrcreplay.pipeline.kernel_build import ensure_compiled
 from hrcreplay.pipeline.progress import ProgressBar, print_note
 from hrcreplay.pipeline.robot_mass import robot_mass
 from hrcreplay.pipeline.run_config import RunConfig, RunOptions, resolve
 from hrcreplay.pipeline.second_process import second_process
 from hrcreplay.pipeline.stages import Sink, collect_plan_findings
+from hrcreplay.pipeline.surroundings import Forecast
 from hrcreplay.records import RECORDED, UNGUARDED, Floats, Ints
 from hrcreplay.reporting import comparison
 from hrcreplay.reporting.comparison import Variant

@@ -20,8 +20,8 @@ import pyarrow.parquet as pq
 from hrcreplay.errors import SettingsError
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.pipeline import assembly
-from hrcreplay.pipeline.assembly import Forecast
 from hrcreplay.pipeline.run_config import RunConfig, resolve
+from hrcreplay.pipeline.surroundings import Forecast, Surroundings
 from hrcreplay.records import ALLOWING_CONTACT, LIMBS, RECORDED, STATUSES, Floats, HumanStates, Ints, of_person
 from hrcreplay.reporting.metrics.planning import stationary
 from hrcreplay.reporting.metrics.series import true_runs
@@ -78,7 +78,7 @@ class Record:
         return assembly.programme(self.run_config, self.log, robot)
 
     @cached_property
-    def surroundings(self) -> assembly.Surroundings:
+    def surroundings(self) -> Surroundings:
         """Returns the obstacles of the robot."""
         return assembly.surroundings(self.run_config, self.programme.path.model)
 

@@ -27,9 +27,9 @@ from hrcreplay.geometry.distances import nearest_pair, protrusion_m
 from hrcreplay.human.model import LEG_PARTS, PARTS, part_radii
 from hrcreplay.logs.reader import Log
 from hrcreplay.pipeline import assembly, stages
-from hrcreplay.pipeline.assembly import PredictionStage
 from hrcreplay.pipeline.person_fuser import PersonFuser
 from hrcreplay.pipeline.run_config import RunConfig
+from hrcreplay.pipeline.surroundings import PredictionStage
 from hrcreplay.records import ALLOWING_CONTACT, BODY, RECORDED, UNGUARDED, Bools, Floats, HumanStates, Ints, SweptVolume
 from hrcreplay.robot.model import LinkMotion, RobotModel
 from hrcreplay.robot.recorded import CapsuleSample, RecordedCapsules

@@ -15,7 +15,7 @@ from hrcreplay.evaluation.recorded_person import LIMB_POINTS, RecordedPerson
 from hrcreplay.geometry.inflated_hull import InflatedHull, union_volume_m3
 from hrcreplay.human.prediction.sound_reach import THIGH_M
 from hrcreplay.human.prediction.swept_volumes import limb_radii
-from hrcreplay.pipeline.assembly import PredictionStage
+from hrcreplay.pipeline.surroundings import PredictionStage
 from hrcreplay.records import BODY, LIMBS, POINTS, Bools, Floats, HumanStates, Ints, SweptVolumes, Table
 from hrcreplay.settings.sections import Fusion
 

@@ -16,7 +16,7 @@ from hrcreplay.errors import LogError
 from hrcreplay.human.fusion import fuse, inverse_kinematics
 from hrcreplay.human.model import part_axes, skeleton
 from hrcreplay.logs.reader import Log
-from hrcreplay.pipeline.assembly import FusionStage
+from hrcreplay.pipeline.fusion_stage import FusionStage
 from hrcreplay.pipeline.person_fuser import PersonFuser
 from hrcreplay.pipeline.stages import PeopleSmoother, batches
 from hrcreplay.records import (

@@ -12,7 +12,7 @@ from hrcreplay.human.fusion import fuse, inverse_kinematics, people, vacancy
 from hrcreplay.human.fusion.fuse import Trace
 from hrcreplay.human.fusion.people import PeopleRules
 from hrcreplay.logs.cleaning import PersonMemory
-from hrcreplay.pipeline.assembly import FusionStage, Sightings
+from hrcreplay.pipeline.fusion_stage import FusionStage, Sightings
 from hrcreplay.records import NOBODY, CameraFrames, HumanStates, Ints, Measurements
 
 

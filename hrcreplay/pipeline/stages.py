@@ -17,9 +17,11 @@ from hrcreplay.human.fusion import fuse, inverse_kinematics, vacancy
 from hrcreplay.logs.camera_checks import CameraChecks
 from hrcreplay.logs.clocks import delay_text
 from hrcreplay.logs.reader import Log
-from hrcreplay.pipeline.assembly import Follower, Forecast, FusionStage, PredictionStage, Surroundings
+from hrcreplay.pipeline.assembly import Follower
+from hrcreplay.pipeline.fusion_stage import FusionStage
 from hrcreplay.pipeline.person_fuser import PersonFuser
 from hrcreplay.pipeline.run_config import RunConfig
+from hrcreplay.pipeline.surroundings import Forecast, PredictionStage, Surroundings
 from hrcreplay.records import (
     FLOOR_Z_M,
     NOBODY,

@@ -17,7 +17,7 @@ from hrcreplay.commands import audit
 from hrcreplay.evaluation import recorded_person
 from hrcreplay.limits import load_limits
 from hrcreplay.logs.writer import LogWriter
-from hrcreplay.pipeline.assembly import FusionStage
+from hrcreplay.pipeline.fusion_stage import FusionStage
 from hrcreplay.records import BODY, DOF, JOINTS, LIMBS, POINTS, Bools, Floats, Ints, Measurements
 from hrcreplay.settings.sections import Fusion
 from tests.audit.standing import frames, standing

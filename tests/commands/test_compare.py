@@ -22,6 +22,7 @@ from hrcreplay.human.model import skeleton
 from hrcreplay.logs.reader import open_log
 from hrcreplay.pipeline import assembly
 from hrcreplay.pipeline.run_config import resolve
+from hrcreplay.pipeline.surroundings import PredictionStage
 from hrcreplay.records import JOINTS, LENGTHS, POINTS, Floats, HumanStates, Ints
 from hrcreplay.reporting import comparison
 from hrcreplay.reporting.comparison import FIELDS, Variant
@@ -257,7 +258,7 @@ WHOLE = {
 
 
 def _all_inside(
-    stage: assembly.PredictionStage, state: HumanStates, horizon_s: float, at_ns: Ints, points: Floats
+    stage: PredictionStage, state: HumanStates, horizon_s: float, at_ns: Ints, points: Floats
 ) -> bool | None:
     """Whether every limb, point by point, is whole inside its volume until the horizon; None where none was seen."""
     now_ns, until_ns = int(state.t_ns[0]), round(1e9 * horizon_s)

@@ -11,7 +11,7 @@ import pytest
 from hrcreplay.geometry.polygon import ConvexPolygon
 from hrcreplay.human.fusion.vacancy import WatchedArea
 from hrcreplay.limits import load_limits
-from hrcreplay.pipeline.assembly import Forecast, PredictionStage, Surroundings, WatchedBorder
+from hrcreplay.pipeline.surroundings import Forecast, PredictionStage, Surroundings, WatchedBorder
 from hrcreplay.records import BODY, BORDER, HumanStates
 from hrcreplay.robot.control.border import Border
 from hrcreplay.robot.control.control_step import NO_HUMAN, RobotState, observe

@@ -20,8 +20,8 @@ from scipy.spatial import ConvexHull
 from hrcreplay.calibration.cell_objects import CellObject
 from hrcreplay.logs.reader import open_log
 from hrcreplay.pipeline import assembly, stages
-from hrcreplay.pipeline.assembly import Forecast
 from hrcreplay.pipeline.run_config import RunConfig, resolve
+from hrcreplay.pipeline.surroundings import Forecast
 from hrcreplay.records import Floats, HumanStates
 from hrcreplay.robot.control.control_step import Stop
 from hrcreplay.robot.control.controllers import Controller

@@ -27,9 +27,9 @@ from hrcreplay.evaluation.recorded_person import LIMB_POINTS, read_recordings
 from hrcreplay.human.prediction.swept_volumes import Predictor, PreparedPerson
 from hrcreplay.logs.reader import open_log
 from hrcreplay.pipeline import assembly
-from hrcreplay.pipeline.assembly import PredictionStage
 from hrcreplay.pipeline.run_config import RunConfig, RunOptions, resolve
 from hrcreplay.pipeline.stages import span_ns, tick_times
+from hrcreplay.pipeline.surroundings import PredictionStage
 from hrcreplay.records import POINTS, Floats, HumanStates, Ints, SweptVolumes
 from hrcreplay.store import run_folder
 from hrcreplay.store.columns import read_states

@@ -24,8 +24,9 @@ from hrcreplay.logs.cleaning import Cleaner
 from hrcreplay.logs.decoders import own_row
 from hrcreplay.logs.messages import Undecodable
 from hrcreplay.logs.skeleton_pb2 import Skeleton
-from hrcreplay.pipeline.assembly import FusionStage, Surroundings
+from hrcreplay.pipeline.fusion_stage import FusionStage
 from hrcreplay.pipeline.person_fuser import PersonFuser
+from hrcreplay.pipeline.surroundings import Surroundings
 from hrcreplay.records import CameraFrames, Floats, Ints, SweptVolumes
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.control_step import (

@@ -1,0 +1,183 @@
+"""Stage 2 with its settings, and the obstacles of a robot: people's volumes, and the border of a watched area."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+
+import numpy as np
+
+from hrcreplay.human.fusion.vacancy import WatchedArea
+from hrcreplay.human.model import LimitSet
+from hrcreplay.human.prediction import swept_volumes
+from hrcreplay.records import (
+    BORDER,
+    HumanStates,
+    SweptVolumes,
+    volume_name,
+)
+from hrcreplay.robot.control.border import Border
+from hrcreplay.robot.control.controllers import Predict
+from hrcreplay.robot.control.separation import Obstacles, join_obstacles, obstacles
+from hrcreplay.settings.sections import Prediction
+
+
+@dataclass(frozen=True)
+class PredictionStage:
+    """Stage 2: limit set, horizon, radii, margins and method of the swept volumes."""
+
+    limits: LimitSet
+    settings: Prediction
+    memory_s: float  #: time for which the filter continues without a measurement [s]
+
+    @property
+    def horizon_s(self) -> float:
+        """Braking time T_s of the robot [s]."""
+        return self.settings.stop_s
+
+    @property
+    def method(self) -> str:
+        """Method of the prediction."""
+        return self.settings.method
+
+    @property
+    def limbs(self) -> tuple[str, ...]:
+        """Limbs that have volumes."""
+        return swept_volumes.limbs_of(self.settings)
+
+    def by(self, method: str) -> PredictionStage:
+        """Returns the stage with another method."""
+        return replace(self, settings=self.settings.model_copy(update={"method": method}))
+
+    def reachable(self, states: HumanStates) -> swept_volumes.Reach:
+        """Computes the reachable interval of every joint at every tick."""
+        return swept_volumes.reachable(
+            states, self.limits, self.settings, horizon_s=self.horizon_s, memory_s=self.memory_s
+        )
+
+    def volumes(
+        self, states: HumanStates, horizon_s: float | None = None, *, method: str | None = None
+    ) -> SweptVolumes:
+        """Computes the swept volumes of every tick, for replay, live and audit alike.
+
+        Args:
+            states: The fused person.
+            horizon_s: Time after each tick until which they hold; None: the braking time T_s [s].
+            method: None: as in the settings.
+        """
+        if method is not None:
+            return self.by(method).volumes(states, horizon_s)
+        horizon_s = self.horizon_s if horizon_s is None else horizon_s
+        return self.predictor.prepare(states).volumes(horizon_s)
+
+    @cached_property
+    def predictor(self) -> swept_volumes.Predictor:
+        """The stage's predictor, for volumes of the same people at several horizons."""
+        return swept_volumes.Predictor(self.limits, self.settings, self.memory_s)
+
+
+@dataclass(frozen=True)
+class WatchedBorder:
+    """The border of a watched area around the robot, and the speed of people who enter."""
+
+    area: WatchedArea
+    border: Border
+    latency_s: float  #: from the newest capture to the robot's reaction [s]
+
+    def depth_m(self, since_s: float, horizon_s: float) -> float:
+        """Depth that a person outside ``since_s`` [s] ago can reach within ``horizon_s`` [m]."""
+        return float(self.area.reached_m(since_s + horizon_s + self.latency_s))
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """Obstacles of a robot: the people's volumes, and the border beyond which unseen people may be.
+
+    A person whose newest frame is too old is unknown. No person is needed while the watched area is certainly empty.
+    """
+
+    prediction: PredictionStage
+    fresh_s: float  #: maximum age of a person's newest frame, since its capture; an older person is unknown [s]
+    watched: WatchedBorder | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the obstacles beside one person: the limbs that have volumes, then the sides of the border."""
+        sides = 0 if self.watched is None else len(self.watched.border.normals)
+        return (*self.prediction.limbs, *(BORDER,) * sides)
+
+    def names_of(self, people: int) -> tuple[str, ...]:
+        """Names of all obstacles beside so many people: ``names``, then the limbs of persons 2, 3, ..."""
+        names, limbs = self.names, self.prediction.limbs
+        return tuple(volume_name(i, names, limbs) for i in range(len(names) + (people - 1) * len(limbs)))
+
+    def obstacles(self, states: HumanStates, rows: slice, people: Sequence[Obstacles]) -> Obstacles:
+        """Returns the volumes of a tick and the border, as far as they are known.
+
+        Args:
+            states: The fused people.
+            rows: Rows of the tick, one per person.
+            people: Their volumes at that tick.
+        """
+        fresh = states.frame_age_s[rows] <= self.fresh_s
+        numbers = [1] * len(fresh) if states.person is None else states.person[rows].tolist()
+        if self.watched is None or states.nobody_s is None or states.nobody_else_s is None:
+            found = join_obstacles(people)
+            return self._numbered(found if all(fresh.tolist()) else replace(found, known=False), numbers)
+        since_s = float(np.where(fresh, states.nobody_else_s[rows], states.nobody_s[rows]).max())
+        horizon_s = people[0].horizon_s
+        depth_m = self.watched.depth_m(since_s, horizon_s)
+        known = [one for one, there in zip(people, fresh.tolist(), strict=True) if there]
+        person = join_obstacles(known) if known else len(self.prediction.limbs)
+        there = [number for number, is_fresh in zip(numbers, fresh.tolist(), strict=True) if is_fresh]
+        return self._numbered(self.watched.border.obstacles(depth_m, horizon_s, person), there)
+
+    def _numbered(self, found: Obstacles, numbers: Sequence[int]) -> Obstacles:
+        """The volumes of people and what follows them, with their places in ``names_of`` if that is needed."""
+        if all(number == 1 for number in numbers):
+            return found
+        people, each = np.array(numbers), len(self.prediction.limbs)
+        first = np.where(people == 1, 0, len(self.names) + (people - 2) * each)
+        limbs = (first[:, None] + np.arange(each)).ravel()
+        rest = each + np.arange(len(found.radius_m) - len(limbs))
+        return replace(found, numbers=np.concatenate([limbs, rest]))
+
+
+@dataclass
+class Forecast:
+    """Obstacles of a batch of ticks, at any horizon."""
+
+    around: Surroundings
+    states: HumanStates
+
+    def __post_init__(self) -> None:
+        self.t_ns, self._first = self.states.ticks()
+
+    @cached_property
+    def person(self) -> swept_volumes.PreparedPerson:
+        """The people, prepared for volumes at any horizon."""
+        return self.around.prediction.predictor.prepare(self.states)
+
+    @cached_property
+    def full(self) -> SweptVolumes:
+        """Volumes of all rows for the braking time T_s."""
+        return self.person.volumes(self.around.prediction.horizon_s)
+
+    def rows(self, tick: int) -> slice:
+        """The rows of a tick, one per person."""
+        return slice(int(self._first[tick]), int(self._first[tick + 1]))
+
+    def obstacles(self, tick: int, horizon_s: float) -> Obstacles:
+        """Obstacles of one tick up to ``horizon_s`` [s]."""
+        rows = self.rows(tick)
+        if horizon_s == self.around.prediction.horizon_s:
+            people = [obstacles(self.full, row, horizon_s) for row in range(rows.start, rows.stop)]
+        else:
+            volumes = self.person.volumes(horizon_s, rows.start, rows.stop)
+            people = [obstacles(volumes, row, horizon_s) for row in range(len(volumes))]
+        return self.around.obstacles(self.states, rows, people)
+
+    def predict(self, tick: int) -> Predict:
+        """Obstacles of one tick as a function of the horizon."""
+        return partial(self.obstacles, tick)
