@@ -17,7 +17,7 @@ MODULES = sorted(path for path in PACKAGE.rglob("*.py") if not path.name.endswit
 #: A function with at least so many parameters needs an Args section.
 MANY = 4
 #: The command line: here the help of each option documents it, and a docstring is the text of --help.
-COMMANDS = ("cli/app.py", "cli/live.py")
+COMMANDS = ("cli/app.py", "cli/live.py", "cli/scale.py")
 
 _SECTIONS = re.compile(r"^(Returns|Raises|Yields|Attributes):$", re.MULTILINE)
 

@@ -232,15 +232,13 @@ def run_stages(
         every = stages.store_every(run_config) if "predict" in todo else math.inf
         others = [name for name, one in moved.items() if not one.chosen and name != RECORDED]
         if second is not None and others:
-            elsewhere = second.submit(
-                follow_methods, run_config, ticks_ns, size, others, folder, fused_before="fuse" not in todo
-            )
+            task = run_config, ticks_ns, size, others, folder
+            elsewhere = second.submit(follow_methods, *task, fused_before="fuse" not in todo)
             moved = {name: one for name, one in moved.items() if name not in others}
         flow = stages.plan_batches(states, assembly.surroundings(run_config, robot), moved, every, sink)
     elif "predict" in todo:
-        flow = stages.predict_batches(
-            states, assembly.prediction_stage(run_config), stages.store_every(run_config), sink
-        )
+        every = stages.store_every(run_config)
+        flow = stages.predict_batches(states, assembly.prediction_stage(run_config), every, sink)
     if todo:
         for _ in flow:
             pass

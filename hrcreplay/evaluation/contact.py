@@ -250,12 +250,12 @@ def contact_table(
     """
     prediction, t_ns = run_config.settings.prediction, motion["t_ns"].to_numpy()
     radii_m = part_radii(prediction, run_config.settings.report.leg_radius_m)
-    groups, moving = [*(one.tracks for one in people.people), people.others], _is_turning(motion)
-    links = tuple(segment.name for segment in robot.segments)
+    groups = [*(one.tracks for one in people.people), people.others]
     if capsules is None:
+        links, moving = tuple(segment.name for segment in robot.segments), _is_turning(motion)
         *each, other = nearest(robot, motion, groups, radii_m, prediction.hand_m)
     else:
-        sample, links = capsules.sample(t_ns), capsules.names
+        links, sample = capsules.names, capsules.sample(t_ns)
         moving = np.asarray(np.nan_to_num(sample.velocity).any(axis=(1, 2, 3)))
         *each, other = (nearest_capsule(sample, t_ns, tracks, radii_m, prediction.hand_m) for tracks in groups)
     person = _nearest_person(each, people)

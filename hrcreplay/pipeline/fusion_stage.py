@@ -12,14 +12,7 @@ from hrcreplay.human.fusion import inverse_kinematics
 from hrcreplay.human.fusion.vacancy import WatchedArea
 from hrcreplay.human.model import LimitSet
 from hrcreplay.logs.cleaning import PersonMemory, select_person
-from hrcreplay.records import (
-    NOBODY,
-    Bools,
-    CameraFrames,
-    Floats,
-    Ints,
-    Measurements,
-)
+from hrcreplay.records import NOBODY, Bools, CameraFrames, Floats, Ints, Measurements
 from hrcreplay.settings.sections import Fusion
 
 

@@ -11,12 +11,7 @@ import numpy as np
 from hrcreplay.human.fusion.vacancy import WatchedArea
 from hrcreplay.human.model import LimitSet
 from hrcreplay.human.prediction import swept_volumes
-from hrcreplay.records import (
-    BORDER,
-    HumanStates,
-    SweptVolumes,
-    volume_name,
-)
+from hrcreplay.records import BORDER, HumanStates, SweptVolumes, volume_name
 from hrcreplay.robot.control.border import Border
 from hrcreplay.robot.control.controllers import Predict
 from hrcreplay.robot.control.separation import Obstacles, join_obstacles, obstacles
