@@ -151,18 +151,18 @@ def _compare_bone(filter_: Filter, c: int, now: int, side: int, bone: int, near:
     upper, lower = 2 * bone + side, 2 * bone + 2 + side
     if not (near[upper] and near[lower]):
         return
-    model = filter_.model
+    model, own = filter_.model, 2 * bone + side  # each leg for itself: a whole one does not vouch for the other
     length = distance(filter_.gate.points[c, LEG_POINTS[upper]], filter_.gate.points[c, LEG_POINTS[lower]])
-    seen, mean = model.leg_bones_seen[c, bone], model.leg_bones[c, bone]
+    seen, mean = model.leg_bones_seen[c, own], model.leg_bones[c, own]
     if seen >= _BONES_KNOWN:
-        if now - model.leg_bones_ns[c, bone] > SHOWN_NS:  # not a skeleton that falls apart: another length
+        if now - model.leg_bones_ns[c, own] > SHOWN_NS:  # not a skeleton that falls apart: another length
             seen = 0
         elif abs(length - mean) > BROKEN * mean:
             near[lower::2] = False
             return
     seen = min(seen + 1, _BONES_MOST)
-    model.leg_bones[c, bone] = mean + (length - mean) / seen
-    model.leg_bones_seen[c, bone], model.leg_bones_ns[c, bone] = seen, now
+    model.leg_bones[c, own] = mean + (length - mean) / seen
+    model.leg_bones_seen[c, own], model.leg_bones_ns[c, own] = seen, now
 
 
 @njit(cache=True, inner=True)

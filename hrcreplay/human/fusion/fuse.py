@@ -118,9 +118,9 @@ def start(cameras: tuple[str, ...]) -> FusionState:
             offset_ns=np.full(len(POINTS), NEVER_NS),
             carried=np.full((c, len(POINTS), 3), np.nan),
             carried_ns=np.full((c, len(POINTS)), NEVER_NS),
-            leg_bones=np.zeros((c, 2)),
-            leg_bones_seen=np.zeros((c, 2), dtype=np.int64),
-            leg_bones_ns=np.full((c, 2), NEVER_NS),
+            leg_bones=np.zeros((c, 4)),
+            leg_bones_seen=np.zeros((c, 4), dtype=np.int64),
+            leg_bones_ns=np.full((c, 4), NEVER_NS),
             foot=np.tile(FOOT_M, (2, 1)),
         ),
     )

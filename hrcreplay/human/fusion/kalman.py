@@ -68,9 +68,9 @@ class ModelResidual(NamedTuple):
     offset_ns: Ints  #: (20,) tick of the last sample
     carried: Floats  #: (c, 20, 3) each camera's hands from the wrist, legs from below the pelvis, others from the model
     carried_ns: Ints  #: (c, 20) capture of that observation
-    leg_bones: Floats  #: (c, 2) mean length of the thighs and shanks that a camera shows [m]
-    leg_bones_seen: Ints  #: (c, 2) number of observations in that mean
-    leg_bones_ns: Ints  #: (c, 2) tick at which one last agreed with it
+    leg_bones: Floats  #: (c, 4) mean length of the thighs, then shanks, right and left, that a camera shows [m]
+    leg_bones_seen: Ints  #: (c, 4) number of observations in that mean
+    leg_bones_ns: Ints  #: (c, 4) tick at which one last agreed with it
     foot: Floats  #: (2, 3) last observed offset of the right and left foot from the ankle, in the body's heading [m]
 
 

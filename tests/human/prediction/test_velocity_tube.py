@@ -154,6 +154,26 @@ def test_a_limb_may_be_where_the_residual_says_whatever_the_departures() -> None
         np.testing.assert_allclose(volumes.radius_m[:, k], FLESH_M[limb] + states.residual_m[:, k], atol=2e-9)
 
 
+def test_until_the_residual_is_known_the_errors_of_the_lengths_up_to_a_limb_count() -> None:
+    """Each limb's near end with the lengths wrong by two standard deviations, in every combination of signs."""
+    near = {"URA": "shoulder_r", "LRA": "elbow_r", "ULA": "shoulder_l", "LLA": "elbow_l"}
+    states, unknown_m = people(6, seed=5), Prediction().residual_unknown_m
+    std_m = np.random.default_rng(6).uniform(0.005, 0.03, states.lengths_m.shape)
+    states = replace(states, residual_m=np.full_like(states.residual_m, np.nan), lengths_std_m=std_m)
+    nothing = Departure(np.array([0.1]), *np.zeros((2, len(BODY), 1)), *np.zeros((2, 1)))
+    volumes = predict(states, replace(PEOPLE, departure=nothing), Prediction(), horizon_s=0.1, memory_s=MEMORY_S)
+    signs = np.array(np.meshgrid(*[(-2.0, 2.0)] * std_m.shape[1])).reshape(std_m.shape[1], -1).T
+    for tick in range(len(states)):
+        p = np.tile(states.p[tick], (len(signs), 1))
+        plain = skeleton(p[:1], states.lengths_m[tick : tick + 1])[0]
+        wrong = np.linalg.norm(skeleton(p, states.lengths_m[tick] + signs * std_m[tick]) - plain, axis=2).max(axis=0)
+        for k, limb in enumerate(LIMBS):
+            off_m = wrong[POINTS.index(near[limb])] if limb in near else 0.0
+            more_m = volumes.radius_m[tick, k] - FLESH_M[limb] - unknown_m
+            assert more_m >= off_m - 1e-9
+            assert more_m <= 1.5 * off_m + 2e-9
+
+
 def without(limits: LimitSet) -> LimitSet:
     return replace(limits, departure=None)
 
