@@ -3,13 +3,13 @@
 A body that has only just been seen counts by its points alone, as it has no filtered state yet. A limb is the hull of
 the points that the newest frame shows of it, or of all points of the body if it shows none, with the limb's radius, a
 hand's length for the lower arms, and the way that people cover since the frame's capture until the end of the horizon,
-at ``SPEED_M_PER_S``. The lower body reaches down to the floor. Limbs that no point shows may be further out: the volume
+at ``HAND_M_PER_S``. The lower body reaches down to the floor. Limbs that no point shows may be further out: the volume
 is only as good as the points, and holds until the filter knows the person.
 
-If the torso of a person is out of sight, its joints may be anywhere within their limits, and with them the whole body.
-But every limb is attached to every other one: it lies within the bones between them from any point that is still shown,
-and that point moves no faster than people do. A polytope around the intersection of these balls and the volume of the
-joints replaces the latter where it is smaller.
+If the torso of a person is out of sight, the filter brings it to rest, and after a while its joints may be anywhere
+within their limits, and with them the whole body. But every limb is attached to every other one: it lies within the
+bones between them from any point that is still shown, and that point moves no faster than people do. A polytope around
+the intersection of these balls, or of them and the volume so far, replaces the latter where it is smaller.
 """
 
 from __future__ import annotations
@@ -18,15 +18,12 @@ import numpy as np
 
 from hrcreplay.geometry.convex_hull import CORNERS, DIRECTIONS, around
 from hrcreplay.human.prediction.sound_reach import BONE_M, THIGH_M
+from hrcreplay.human.prediction.velocity_tube import HAND_M_PER_S, PEOPLES_SPEEDS
 from hrcreplay.records import BODY, FLOOR_Z_M, LENGTHS, POINTS, Bools, Floats, HumanStates, Ints, SweptVolumes
 from hrcreplay.settings.sections import Prediction
 
-#: Speed at which a body's points may move: that of a hand, ISO 13855 [m/s].
-SPEED_M_PER_S = 2.0
-#: Speed at which a person walks, ISO 13855 [m/s].
-WALKING_M_PER_S = 1.6
-#: Maximum age of a shown point [s].
-_SHOWN_S = 0.2
+#: Maximum age of a shown point; once the torso is unseen for longer, all points that cameras show are known [s].
+SHOWN_S = 0.2
 #: Standard deviations of the lengths of bones that count.
 _LENGTHS_OFF = 2.0
 
@@ -71,7 +68,7 @@ def around_points(
         for k, limb in enumerate(volumes.limbs):
             parts[i * each + k] = _points_of(limb, shown)
             hand_m = prediction.hand_m if limb in ("LRA", "LLA") else 0.0
-            radius_m[i, k] = thick_m[BODY.index(limb)] + hand_m + SPEED_M_PER_S * span_s
+            radius_m[i, k] = thick_m[BODY.index(limb)] + hand_m + HAND_M_PER_S * span_s
     offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum([len(part) for part in parts])])
     return SweptVolumes(volumes.t_ns, offsets, np.concatenate(parts), radius_m, volumes.limbs, volumes.method)
 
@@ -88,11 +85,12 @@ def _points_of(limb: str, shown_m: Floats) -> Floats:
     return np.concatenate([points, below])
 
 
-#: Bones between POINTS, and their lengths: one of LENGTHS, or a number [m].
-_BONES = (
+#: Bones between POINTS, and their lengths: one of LENGTHS, or a number [m]; two of LENGTHS stand at a right angle.
+_BONES: tuple[tuple[str, str, str | tuple[str, ...] | float], ...] = (
     ("pelvis", "neck", "pi_torso"),
     ("neck", "head", "pi_head"),
     *(("neck", f"shoulder_{side}", "pi_half_shoulder") for side in "rl"),
+    *(("pelvis", f"shoulder_{side}", ("pi_torso", "pi_half_shoulder")) for side in "rl"),
     *((f"shoulder_{side}", f"elbow_{side}", f"pi_upper_arm_{side}") for side in "rl"),
     *((f"elbow_{side}", f"wrist_{side}", f"pi_forearm_{side}") for side in "rl"),
     *(("pelvis", f"hip_{side}", 0.5 * BONE_M) for side in "rl"),
@@ -115,43 +113,49 @@ _CONTAINED = _ROWS | {
 
 
 def bound_by_seen(
-    volumes: SweptVolumes, states: HumanStates, rows: Ints, prediction: Prediction, horizon_s: float
+    volumes: SweptVolumes, states: HumanStates, radii_m: Floats, rows: Ints, prediction: Prediction, horizon_s: float
 ) -> SweptVolumes:
     """Cuts volumes of people whose torso is out of sight to what the points shown of them allow.
 
     Args:
-        volumes: Volumes of the same rows, from the joints.
+        volumes: Volumes of the same rows, from the joints or from tubes.
         states: The fused people.
+        radii_m: (n, limbs) radii of volumes from the joints [m].
         rows: Rows of such people.
         prediction: Length of a hand, and latency.
         horizon_s: Time after each tick until which the volumes hold [s].
     """
     each, parts = len(volumes.limbs), np.split(volumes.vertices_m, volumes.offsets[1:-1])
-    of_cameras = states.camera_points_m
+    of_cameras, radius_m = states.camera_points_m, volumes.radius_m.copy()
     if of_cameras is None:
         return volumes
     for i in rows.tolist():
         cameras, seen = np.nonzero(np.isfinite(of_cameras[i]).all(axis=2))
         if not len(seen):
             continue
-        span_s = min(float(states.frame_age_s[i]), _SHOWN_S) + horizon_s + prediction.latency_s
+        span_s = min(float(states.frame_age_s[i]), SHOWN_S) + horizon_s + prediction.latency_s
         apart_m = _along_bones(states.lengths_m[i] + _LENGTHS_OFF * states.lengths_std_m[i])[:, seen]
         for k, limb in enumerate(volumes.limbs):
             own = i * each + k
             hand_m = prediction.hand_m if limb in ("LRA", "LLA") else 0.0
-            speed = SPEED_M_PER_S if limb in ("URA", "LRA", "ULA", "LLA") else WALKING_M_PER_S
-            extents = _reach(limb, of_cameras[i][cameras, seen], seen, apart_m, hand_m + speed * span_s)
-            if np.isfinite(parts[own]).all():
-                extents = np.minimum(extents, (parts[own] @ DIRECTIONS.T).max(axis=0))
-            found = np.empty((CORNERS, 3))
-            found = found[: around(extents, found)]
-            if _box_m3(found) < _box_m3(parts[own]):
-                parts[own] = found
+            further_m = hand_m + float(PEOPLES_SPEEDS[BODY.index(limb)]) * span_s
+            plain, ball_m, own_ball_m = parts[own], float(radii_m[i, k]), float(radius_m[i, k])
+            top_m = plain[:, 2].max() if np.isfinite(plain).all() else np.inf
+            extents = [_reach(limb, of_cameras[i][cameras, seen], seen, apart_m, further_m, top_m)]
+            if np.isfinite(plain).all():  # inside that volume, too, but for the ball that both have
+                more_m = max(0.0, own_ball_m - ball_m)
+                extents.append(np.minimum(extents[0], (plain @ DIRECTIONS.T).max(axis=0) + more_m))
+            least_m3 = _box_m3(plain, own_ball_m)
+            for far in extents:
+                found = np.empty((CORNERS, 3))
+                found = found[: around(far, found)]
+                if (size_m3 := _box_m3(found, ball_m)) < least_m3:
+                    parts[own], radius_m[i, k], least_m3 = found, ball_m, size_m3
     offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum([len(part) for part in parts])])
-    return SweptVolumes(volumes.t_ns, offsets, np.concatenate(parts), volumes.radius_m, volumes.limbs, volumes.method)
+    return SweptVolumes(volumes.t_ns, offsets, np.concatenate(parts), radius_m, volumes.limbs, volumes.method)
 
 
-def _reach(limb: str, shown: Floats, seen: Ints, apart_m: Floats, further_m: float) -> Floats:
+def _reach(limb: str, shown: Floats, seen: Ints, apart_m: Floats, further_m: float, top_m: float) -> Floats:
     """(d,) extents along ``DIRECTIONS`` of where a limb may be, before its ball [m].
 
     Args:
@@ -160,15 +164,16 @@ def _reach(limb: str, shown: Floats, seen: Ints, apart_m: Floats, further_m: flo
         seen: (m,) which of POINTS they are.
         apart_m: (20, m) distance of every point from them along the bones [m].
         further_m: What is added to each [m].
+        top_m: Maximum height of the pelvis [m].
     """
     along, found = DIRECTIONS @ shown.T, np.full(len(DIRECTIONS), -np.inf)
     for point in _CONTAINED[limb]:
         found = np.maximum(found, (along + apart_m[point]).min(axis=1))
-    if limb == BODY[_LEGS]:  # down to the floor, and the legs that are shown
-        flat = DIRECTIONS * [1.0, 1.0, 0.0]
+    if limb == BODY[_LEGS]:  # below the pelvis down to the floor, and the legs that are shown
+        far_m, flat = apart_m[_PELVIS] + further_m, DIRECTIONS * [1.0, 1.0, 0.0]
         size = np.linalg.norm(flat, axis=1, keepdims=True)
-        below = (flat @ shown.T + size * (apart_m[_PELVIS] + further_m)).min(axis=1) - further_m
-        found = np.maximum(found, below + FLOOR_Z_M * DIRECTIONS[:, 2])
+        heights = DIRECTIONS[:, 2:] * [FLOOR_Z_M, min(top_m, float((shown[:, 2] + far_m).min()))]
+        found = (flat @ shown.T + size * far_m).min(axis=1) + heights.max(axis=1) - further_m
         legs = np.isin(seen, _ROWS[limb])
         found = np.maximum(found, along[:, legs].max(axis=1, initial=-np.inf))
     return np.asarray(found + further_m)
@@ -178,14 +183,21 @@ def _along_bones(lengths_m: Floats) -> Floats:
     """(20, 20) distance between POINTS along the bones, for lengths (7,) [m]; inf for points without one."""
     found = np.full((len(POINTS), len(POINTS)), np.inf)
     np.fill_diagonal(found, 0.0)
-    long = [lengths_m[LENGTHS.index(bone)] if isinstance(bone, str) else bone for _, _, bone in _BONES]
-    found[_STARTS, _TIPS] = found[_TIPS, _STARTS] = long
+    found[_STARTS, _TIPS] = found[_TIPS, _STARTS] = [_length_m(bone, lengths_m) for _, _, bone in _BONES]
     for k in range(len(POINTS)):
         found = np.minimum(found, found[:, k : k + 1] + found[k])
     return found
 
 
-def _box_m3(points: Floats) -> float:
-    """Volume of the box around some points, at least a millimetre wide [m^3]; inf if they are unknown."""
-    size = float(np.prod(np.ptp(points, axis=0) + 1e-3))
+def _length_m(bone: str | tuple[str, ...] | float, lengths_m: Floats) -> float:
+    """Length of one of ``_BONES`` for lengths (7,) [m]."""
+    if isinstance(bone, float):
+        return bone
+    names = (bone,) if isinstance(bone, str) else bone
+    return float(np.linalg.norm(lengths_m[[LENGTHS.index(name) for name in names]]))
+
+
+def _box_m3(points: Floats, radius_m: float) -> float:
+    """Volume of the box around some points with a ball [m^3]; inf if they are unknown."""
+    size = float(np.prod(np.ptp(points, axis=0) + 2.0 * radius_m))
     return size if np.isfinite(size) else np.inf

@@ -263,7 +263,11 @@ def _tube(
         thick = np.fmax(hidden, tubed.legs_m[i] + rules.body_m[limb])
     if not np.isfinite(swept[:count].sum()):
         swept[0], count = np.nan, 1
-    return count, thick + departs_m(limb, reach_s, tubed.residual[i, limb], speed, rules.departure)
+    residual, lost = tubed.residual[i, limb], tubed.lost_m[i, limb]
+    departs = departs_m(limb, reach_s, residual, speed, rules.departure)
+    if lost > 0.0:  # the filter brings an unseen torso to rest, but people walk on
+        departs = max(departs, departs_m(limb, span_s, residual, speed, rules.departure) + lost)
+    return count, thick + departs
 
 
 @njit(cache=True)

@@ -25,7 +25,7 @@ from hrcreplay.human.model import (
     alpha_3_bounds,
     bounds_of,
 )
-from hrcreplay.human.prediction.shown_points import around_points, bound_by_seen, count_by_points
+from hrcreplay.human.prediction.shown_points import SHOWN_S, around_points, bound_by_seen, count_by_points
 from hrcreplay.human.prediction.sound_reach import SoundMotionLimits, enclose, start_states
 from hrcreplay.human.prediction.sound_volumes import SoundRows, SoundRules, sound_rows, sound_rules, sweep_sound
 from hrcreplay.human.prediction.sweep import MOST_COPIES, append, box, kinematic_chain, sweep_rot, sweep_walk
@@ -306,9 +306,10 @@ class PreparedPerson:
         if self.by_points[first:last].any():
             states = self.states.rows(slice(first, last))
             found = around_points(found, states, prediction, self.predictor.limbs_m, horizon_s)
-        if self.partly_seen[first:last].any():
+        if self.rows is not None and self.partly_seen[first:last].any():
             rows = np.flatnonzero(self.partly_seen[first:last])
-            found = bound_by_seen(found, self.states.rows(slice(first, last)), rows, prediction, horizon_s)
+            states, radii_m = self.states.rows(slice(first, last)), self.rows.radii[first:last]
+            found = bound_by_seen(found, states, radii_m, rows, prediction, horizon_s)
         return found
 
     @cached_property
@@ -318,10 +319,11 @@ class PreparedPerson:
 
     @cached_property
     def partly_seen(self) -> Bools:
-        """(n,) True for known people whose torso has no tube although limits bound departures: it is out of sight."""
+        """(n,) True for known people whose torso is out of sight."""
         if self.rows is None or not self.predictor.rules.bounded or self.states.camera_points_m is None:
             return np.zeros(len(self.states), dtype=np.bool_)
-        return ~self.rows.tubed.usable[:, THX] & np.isfinite(self.states.p[:, 0])
+        lost = self.states.unseen_s[:, THX] > SHOWN_S
+        return np.asarray(lost & np.isfinite(self.states.p[:, 0]))
 
     def _filtered(self, horizon_s: float, first: int, last: int) -> SweptVolumes:
         """Volumes from the filtered states; unknown for bodies that have none."""

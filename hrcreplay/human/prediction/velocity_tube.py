@@ -18,7 +18,7 @@ import numpy as np
 
 from hrcreplay.human.model import ARM_POINTS, BENDS, HANDS, HEAD, LEG_POINTS, NECK, PELVIS, LimitSet, skeleton_row
 from hrcreplay.kernels import njit
-from hrcreplay.records import BODY, POINTS, Bools, Floats, HumanStates
+from hrcreplay.records import BODY, LIMBS, POINTS, Bools, Floats, HumanStates
 
 #: Time step of the difference that gives the velocities of the points [s].
 _STEP_S = 1e-4
@@ -42,6 +42,9 @@ for _limb, _carrying in enumerate(((0, 1), (1,), (1, 2), (1, 2, 3), (1, 4), (1, 
     _CARRIED_BY[_limb, _carrying] = True
 #: Speed above which the bound on a limb's departure grows no further [m/s].
 FASTEST_M_PER_S = 1.0
+#: Speeds at which people walk and reach, ISO 13855; of each limb of BODY [m/s].
+WALKING_M_PER_S, HAND_M_PER_S = 1.6, 2.0
+PEOPLES_SPEEDS = np.array([HAND_M_PER_S if limb in LIMBS[2:] else WALKING_M_PER_S for limb in BODY])
 #: Standard deviations of the lengths that count while the residual is unknown.
 _LENGTHS_OFF = 2.0
 #: Maximum number of points of a tube for the fused limb, and for each camera.
@@ -69,6 +72,7 @@ class Tubes(NamedTuple):
     legs_shown: Bools  #: (n,) True: the positions of both knees and ankles are known
     legs_m: Floats  #: (n,) their distance from the line below the pelvis [m]; NaN: unknown or not used
     late_s: Floats  #: (n, 7) time for which it may depart beyond horizon and latency, as it was seen that long ago [s]
+    lost_m: Floats  #: (n, 7) how far people go in the time for which their torso has been out of sight [m]
 
 
 class DepartureTable(NamedTuple):
@@ -110,6 +114,7 @@ def tubes(states: HumanStates, bounded: bool, unknown_m: float, memory_s: float)
         legs_shown=np.empty(n, dtype=np.bool_),
         legs_m=np.full(n, np.nan),
         late_s=np.empty((n, len(BODY))),
+        lost_m=np.zeros((n, len(BODY))),
     )
     unseen_s, residual_m = np.ascontiguousarray(states.unseen_s), np.ascontiguousarray(states.residual_m)
     off_m = np.ascontiguousarray(_LENGTHS_OFF * states.lengths_std_m)
@@ -129,6 +134,7 @@ def _tube_rows(
 ) -> None:
     for i in range(len(unseen_s)):
         displaced = displaced_m(off_m[i])
+        lost_s = max(0.0, min(unseen_s[i, THORAX], memory_s) - _FRESH_S)
         found.legs_shown[i] = np.isfinite(found.points[i][BENDS].sum())
         for limb in range(len(BODY)):
             unseen = -np.inf
@@ -136,6 +142,7 @@ def _tube_rows(
                 if _CARRIED_BY[limb, carrying]:
                     unseen = np.maximum(unseen, unseen_s[i, carrying])
             found.usable[i, limb] = bounded and unseen <= memory_s
+            found.lost_m[i, limb] = PEOPLES_SPEEDS[limb] * lost_s
             if limb == LEGS and found.legs_shown[i]:
                 unseen = np.maximum(unseen, unseen_s[i, LEGS])
             found.late_s[i, limb] = np.minimum(np.maximum(unseen - _FRESH_S, 0.0), memory_s)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from hrcreplay.geometry.inflated_hull import InflatedHull, union_volume_m3
-from hrcreplay.human.prediction.shown_points import SPEED_M_PER_S
 from hrcreplay.human.prediction.swept_volumes import predict
+from hrcreplay.human.prediction.velocity_tube import HAND_M_PER_S
 from hrcreplay.limits import load_limits
 from hrcreplay.records import LIMBS, POINTS, Floats, HumanStates, SweptVolumes
 from hrcreplay.settings.sections import Prediction
@@ -39,7 +39,7 @@ def test_points_that_move_as_fast_as_people_stay_inside(method: str) -> None:
     assert all(volume.known for volume in found.values())
     span_s = 0.05 + HORIZON_S + 0.03
     way = rng.normal(size=(500, 20, 3))
-    way *= SPEED_M_PER_S * span_s / np.linalg.norm(way, axis=2, keepdims=True)
+    way *= HAND_M_PER_S * span_s / np.linalg.norm(way, axis=2, keepdims=True)
     moved = points + way
     radii = {"HD": settings.radius_head_m, "THX": settings.radius_thorax_m}
     for limb, of in (("HD", ("neck", "head")), ("THX", ("pelvis", "chest")), ("LLA", ("elbow_l", "wrist_l"))):
@@ -47,7 +47,7 @@ def test_points_that_move_as_fast_as_people_stay_inside(method: str) -> None:
         for name in of:
             off = solid.distances_m(moved[:, POINTS.index(name)])
             assert off.max() + radii.get(limb, settings.radius_lower_arm_m) <= solid.radius_m + 1e-9
-            assert off.max() > SPEED_M_PER_S * span_s - 0.5  # the check would see a volume that is far too large
+            assert off.max() > HAND_M_PER_S * span_s - 0.5  # the check would see a volume that is far too large
 
 
 def test_a_limb_without_points_gets_those_of_the_body_and_the_known_person_stays_as_it_was() -> None:
@@ -107,15 +107,17 @@ def behind_a_table(shown: tuple[str, ...], seed: int = 1) -> HumanStates:
 
 
 def along(start: str, longer_m: float) -> dict[str, float]:
-    """Distance of every point from one along the bones, one after the other; those of the model are that longer [m]."""
-    found, last = {start: 0.0}, [start]
-    while last:
-        here = last.pop()
-        for (a, b), long in BONES.items():
-            if here in (a, b) and (next_one := b if here == a else a) not in found:
-                of_leg = {a, b} & {"hip_l", "knee_l"}
-                found[next_one] = found[here] + long + (0.0 if of_leg else longer_m)
-                last.append(next_one)
+    """Shortest way from a point to every other one along the bones, and from the pelvis straight to the shoulders [m].
+
+    The bones of the model are that much longer.
+    """
+    ways = {ends: long + (0.0 if {"hip_l", "knee_l"} & set(ends) else longer_m) for ends, long in BONES.items()} | {
+        ("pelvis", f"shoulder_{side}"): float(np.hypot(0.5 + longer_m, 0.19 + longer_m)) for side in "rl"
+    }
+    found = dict.fromkeys({name for ends in BONES for name in ends}, np.inf) | {start: 0.0}
+    for _ in found:
+        for (a, b), long in ways.items():
+            found[a], found[b] = min(found[a], found[b] + long), min(found[b], found[a] + long)
     return found
 
 

@@ -230,6 +230,25 @@ def test_a_limb_seen_a_while_ago_may_have_departed_for_longer() -> None:
     assert (late.radius_m[:, k] > early.radius_m[:, k]).all()
 
 
+@pytest.mark.parametrize("unseen_s", [0.15, 0.2])
+def test_somebody_whose_torso_went_out_of_sight_may_have_walked_on(unseen_s: float) -> None:
+    """At 1.6 m/s, and arms at 2 m/s, since a limb of the fit was seen at the latest."""
+    states, departure = people(3, seed=11), PEOPLE.departure
+    assert departure is not None
+    unseen = states.unseen_s.copy()
+    unseen[:, BODY.index("THX")] = unseen_s
+    late = predict(replace(states, unseen_s=unseen), PEOPLE, Prediction(), horizon_s=0.05, memory_s=MEMORY_S)
+    for tick in range(3):
+        for k, limb in enumerate(BODY):
+            speed = speed_of(states, tick, limb)
+            residual = states.residual_m[tick, BODY.index("THX") if limb == "LEGS" else k]
+            here, later = (
+                allowed_m(departure, limb, h, residual, speed) for h in (0.05, 0.05 + max(0.0, unseen_s - 0.1))
+            )
+            walked = (2.0 if limb in LIMBS[2:] else 1.6) * (unseen_s - 0.1)
+            assert late.radius_m[tick, k] == pytest.approx(FLESH_M[limb] + max(later, here + walked), abs=2e-9)
+
+
 def test_legs_that_were_hidden_just_now_may_have_departed_for_longer() -> None:
     states = people(3, seed=7)
     unseen, k = states.unseen_s.copy(), BODY.index("LEGS")

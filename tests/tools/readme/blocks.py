@@ -15,6 +15,7 @@ from tests.tools.readme.measurements import (
     HORIZONS_MS,
     MARGINS,
     ORACLED,
+    PARTLY_SEEN_OF,
     PLACES,
     RECORDINGS,
     VARIANTS,
@@ -207,6 +208,16 @@ def oracle(facts: Facts) -> str:
     return _table([*head, "near ticks"], rows)
 
 
+def partly_seen(facts: Facts) -> str:
+    """Whole people inside and volumes, where only the arms are seen and where everything is."""
+    of, rows = _of(facts, "partly seen"), []
+    for name in PARTLY_SEEN_OF:
+        each = [f"{name} {when}_{what}" for when in ("just", "long") for what in ("partly", "whole")]
+        rows.append([name, *(f"{_share(of[f'{one}_held'])}, {_m3(of[f'{one}_m3'])}" for one in each)])
+    heads = [f"{when}, {what}" for when in ("0.1 to 0.5 s", "longer") for what in ("arms alone", "everything in sight")]
+    return _table(["recording", *heads], rows)
+
+
 def _departures() -> dict[str, Any]:
     return dict(tomllib.loads(PEOPLE.read_text())["provenance"]["departures"])
 
@@ -253,6 +264,7 @@ BLOCKS: dict[str, Callable[[Facts], str]] = {
     "people": people,
     "misses": misses,
     "oracle": oracle,
+    "partly_seen": partly_seen,
     "margins": margins,
 }
 

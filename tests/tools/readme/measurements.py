@@ -76,6 +76,9 @@ SAMPLES = {
 #: What measures the pace of a controller that knows the future, on recordings by others, too.
 ORACLE = "tests.tools.oracle"
 ORACLED = ("demo", "azure walking", "azure moving", "kinect 2 lines", "kinect 2 sitting", "exp_box")
+#: What hides people but for their arms, and in which recordings.
+PARTLY_SEEN = "tests.tools.partly_seen"
+PARTLY_SEEN_OF = ("demo", "azure walking", "azure squatting", "azure moving")
 #: Recordings by others: name in the README -> name in tests/test_recordings.py, or the bag.
 RECORDINGS = {
     "Azure Kinect, walking": "azure walking",
@@ -105,7 +108,7 @@ class Measurement:
     @property
     def needs_data(self) -> bool:
         """Whether it needs recordings by others."""
-        return any("{data}" in command or command.startswith(ORACLE) for command in self.commands)
+        return any("{data}" in command or command.startswith((ORACLE, PARTLY_SEEN)) for command in self.commands)
 
 
 def of_report(metrics: Mapping[str, Any]) -> Figures:
@@ -145,6 +148,11 @@ def of_oracle(found: Mapping[str, Any]) -> Figures:
     return {f"{name} {key}": value for name in ORACLED for key, value in found[name].items()}
 
 
+def of_partly_seen(found: Mapping[str, Any]) -> Figures:
+    """What is kept of people of whom only the arms are seen, recording by recording."""
+    return {f"{name} {key}": value for name in PARTLY_SEEN_OF for key, value in found[name].items()}
+
+
 def measurements() -> list[Measurement]:
     """All of them, the quick ones first."""
     found = [_audit("audit demo", (DEMO,), {})]
@@ -159,6 +167,9 @@ def measurements() -> list[Measurement]:
     command = f"hrcreplay compare {DEMO} --out {{tmp}}/run"
     found.append(Measurement("compare", (command,), "run/compare.json", of_comparison, {}))
     found += [_recording(name, key) for name, key in RECORDINGS.items()]
+    found.append(
+        Measurement("partly seen", (f"{PARTLY_SEEN} --json {shlex.join(PARTLY_SEEN_OF)}",), "", of_partly_seen, {})
+    )
     found.append(Measurement("oracle", (f"{ORACLE} --json {shlex.join(ORACLED)}",), "", of_oracle, {}))
     for (method, limits), samples in sorted(SAMPLES.items(), key=lambda item: item[1]):
         command = f"tests.tools.soundness --json --samples {samples} --method {method} --limits {limits}"
