@@ -16,7 +16,7 @@ from hrcreplay.cli.app import app
 from hrcreplay.commands import replay, report
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import Run
-from tests.tools import oracle
+from tests.tools import oracle, partly_seen
 from tests.tools.readme import __main__ as readme
 from tests.tools.readme.blocks import BLOCK, BLOCKS, fill
 from tests.tools.readme.measurements import (
@@ -25,6 +25,7 @@ from tests.tools.readme.measurements import (
     DEMO,
     HORIZONS_MS,
     ORACLED,
+    PARTLY_SEEN_OF,
     ROOT,
     VARIANTS,
     Measurement,
@@ -94,6 +95,8 @@ def test_the_commands_parse(measurement: Measurement) -> None:
             commands.commands[words[0]].make_context(words[0], words[1:])
         elif module == "tests.tools.oracle":
             assert oracle.parser().parse_args(words).names == [*ORACLED]
+        elif module == "tests.tools.partly_seen":
+            assert partly_seen.parser().parse_args(words).names == [*PARTLY_SEEN_OF]
         else:
             assert module == "tests.tools.soundness"
             soundness._parser().parse_args(words)
@@ -104,7 +107,8 @@ def _made_up() -> dict[str, Any]:
     numbers = iter(np.linspace(0.1, 0.9, 2000).tolist())
     facts: dict[str, Any] = {}
     for measurement in measurements():
-        made = {"compare": _compared, "oracle": _oracled}.get(measurement.name, _Numbers)
+        kinds = {"compare": _compared, "oracle": _oracled, "partly seen": _partly_seen}
+        made = kinds.get(measurement.name, _Numbers)
         found = measurement.keep(made(numbers))
         facts[measurement.name] = {"figures": dict(found)}
     return facts
@@ -117,6 +121,12 @@ def _compared(numbers: Any) -> dict[str, Any]:
 def _oracled(numbers: Any) -> dict[str, Any]:
     keys = [f"{who}_{what}" for who in ("qp", "oracle") for what in ("pace", "standing")]
     return {name: {**{key: next(numbers) for key in keys}, "near_ticks": 1} for name in ORACLED}
+
+
+def _partly_seen(numbers: Any) -> dict[str, Any]:
+    each = [f"{when}_{what}" for when in ("just", "long") for what in ("partly", "whole")]
+    keys = [f"{one}_{what}" for one in each for what in ("held", "m3")]
+    return {name: {key: next(numbers) for key in keys} for name in PARTLY_SEEN_OF}
 
 
 AUDIT_KEYS = [
