@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hrcreplay.evaluation.recorded_person import LIMB_POINTS, RecordedPerson
+from hrcreplay.geometry.distances import distances
 from hrcreplay.geometry.inflated_hull import InflatedHull, union_volume_m3
 from hrcreplay.human.prediction.sound_reach import THIGH_M
 from hrcreplay.human.prediction.swept_volumes import limb_radii
@@ -138,6 +139,7 @@ def check_containment(
     first_sample: int = 0,
     *,
     sizes: bool = True,
+    exact: bool = True,
 ) -> Outcome:
     """Compares one method's volumes with the recorded future.
 
@@ -148,6 +150,7 @@ def check_containment(
         counted: (n,) the ticks whose union volume is estimated.
         first_sample: Number of ticks estimated before, see ``union_volume_m3``.
         sizes: True: compute the volume of each limb.
+        exact: False: of limbs that stay inside an upper bound of their distance is enough, if no volume is asked for.
     """
     n, limbs = len(volumes), volumes.limbs
     beyond, size = np.full((n, len(limbs)), np.nan), np.full((n, len(limbs)), np.nan)
@@ -159,6 +162,10 @@ def check_containment(
             vertices = volumes.vertices(i, k)
             if np.isnan(vertices).any():
                 continue
+            if not (exact or sizes or counted[i]):
+                beyond[i, k] = _at_most(vertices, future, i, limb) if checked[i, k] else np.nan
+                if not beyond[i, k] + limb_radius[limb] > volumes.radius_m[i, k]:
+                    continue
             solid = InflatedHull.around(vertices, float(volumes.radius_m[i, k]))
             if sizes:
                 size[i, k] = solid.volume_m3()
@@ -177,8 +184,19 @@ def check_containment(
 
 def _farthest(solid: InflatedHull, future: RecordedFuture, tick: int, limb: str) -> float:
     """Returns the maximum distance of a limb's recorded points from a hull; at least one was seen [m]."""
-    points = future.limbs[limb][future.first[tick] : future.last[tick]].reshape(-1, 3)
-    return float(np.nanmax(solid.distances_m(points)))
+    return float(np.nanmax(solid.distances_m(_points(future, tick, limb))))
+
+
+def _at_most(vertices_m: Floats, future: RecordedFuture, tick: int, limb: str) -> float:
+    """Returns an upper bound of the same, of the hull of some points, which need not be its corners [m]."""
+    points = _points(future, tick, limb)
+    known = points[np.isfinite(points).all(axis=1)]
+    _, high, _ = distances(np.stack([known, known], axis=1), vertices_m, np.array([0, len(vertices_m)]))
+    return float(high.max())
+
+
+def _points(future: RecordedFuture, tick: int, limb: str) -> Floats:
+    return future.limbs[limb][future.first[tick] : future.last[tick]].reshape(-1, 3)
 
 
 def select_rows(states: HumanStates, last_ns: int, rate_hz: float, horizon_s: float | Floats, fresh_s: float) -> Ints:
@@ -221,5 +239,7 @@ def coverage(
     outcomes = []
     for i, row in enumerate(rows.tolist()):
         volumes = stage.volumes(asked.rows(slice(i, i + 1)), float(horizon_s[row]))
-        outcomes.append(check_containment(volumes, future.rows(slice(i, i + 1)), radii_m, nothing, sizes=False))
+        outcomes.append(
+            check_containment(volumes, future.rows(slice(i, i + 1)), radii_m, nothing, sizes=False, exact=False)
+        )
     return Outcome.join(outcomes) if outcomes else None

@@ -99,7 +99,7 @@ def _distances(points: Floats, vertices: Floats, faces: Ints) -> Floats:
     behind = _behind(vertices)
     found = np.empty(len(points))
     for i in range(len(points)):
-        found[i] = _distance(points[i], vertices, faces, normals, offsets, behind)
+        found[i] = _distance(points[i], vertices, faces, normals, offsets, behind, 0.0)
     return found
 
 
@@ -132,7 +132,7 @@ def _mark(points: Floats, vertices: Floats, faces: Ints, radius: float, inside: 
             outside = _height(point, normals[f], offsets[f]) > radius
             f += 1
         if not outside:
-            inside[i] = _distance(point, vertices, faces, normals, offsets, behind) <= radius
+            inside[i] = _distance(point, vertices, faces, normals, offsets, behind, radius) <= radius
 
 
 @njit(cache=True)
@@ -157,7 +157,16 @@ def _height(point: Floats, normal: Floats, offset: float) -> float:
 
 
 @njit(cache=True)
-def _distance(point: Floats, vertices: Floats, faces: Ints, normals: Floats, offsets: Floats, behind: float) -> float:
+def _distance(
+    point: Floats,
+    vertices: Floats,
+    faces: Ints,
+    normals: Floats,
+    offsets: Floats,
+    behind: float,
+    enough: float,
+) -> float:
+    """Distance of a point from the hull, or any upper bound of it that is at most ``enough`` [m]."""
     if np.isnan(point[0] + point[1] + point[2]):
         return np.nan
     if len(faces) == 0:
@@ -168,6 +177,8 @@ def _distance(point: Floats, vertices: Floats, faces: Ints, normals: Floats, off
         if height > -behind and height * height < nearest:
             a, b, c = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
             nearest = min(nearest, _triangle(point, a, b, c, normals[f], height))
+            if np.sqrt(nearest) <= enough:
+                break
     return 0.0 if nearest == np.inf else np.sqrt(nearest)
 
 

@@ -130,3 +130,24 @@ def test_every_point_of_a_body_decides_whether_its_limbs_are_held(point: str, li
     outcome = check_containment(volumes, _future(points, people), dict.fromkeys(BODY, 0.0), np.array([False]))
     assert {limb for limb, out_m in zip(BODY, outcome.escape_m()[0], strict=True) if out_m > 0.0} == limbs
     assert np.isfinite(outcome.escape_m()).all()
+
+
+def test_an_upper_bound_is_enough_for_the_limbs_that_stay_inside() -> None:
+    """Random hulls, some of which the recorded limbs leave: the same escapes, and nearly the same distances."""
+    rng, flesh = np.random.default_rng(4), dict.fromkeys(BODY, 0.05)
+    people, outside = states(np.zeros((1, DOF)), np.zeros((1, DOF))), 0
+    for _ in range(40):
+        future = _future(rng.normal(0.0, 0.3, (10, len(POINTS), 3)), people)
+        vertices = rng.normal(0.0, 0.3, (6 * len(BODY), 3))
+        offsets, radius_m = 6 * np.arange(len(BODY) + 1), rng.uniform(0.1, 1.2, (1, len(BODY)))
+        volumes = SweptVolumes(people.t_ns, offsets, vertices, radius_m, BODY, "hulls")
+        exact, enough = (
+            check_containment(volumes, future, flesh, np.array([False]), sizes=False, exact=exact)
+            for exact in (True, False)
+        )
+        np.testing.assert_array_equal(enough.escape_m(), exact.escape_m())
+        left = exact.escape_m() > 0.0
+        np.testing.assert_array_equal(enough.beyond_m[left], exact.beyond_m[left])
+        np.testing.assert_allclose(enough.beyond_m, exact.beyond_m, atol=1e-9)
+        outside += int(left.sum())
+    assert 50 < outside < 40 * len(BODY) - 50

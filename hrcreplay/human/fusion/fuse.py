@@ -337,13 +337,13 @@ def _smooth_joint(
     from filterpy.kalman import KalmanFilter  # slow to import (0.5 s), and only used for smoothing
 
     scale = _UNIT_S ** np.arange(4.0)
-    Fs, Qs = np.zeros_like(cov), np.zeros_like(cov)
-    for k in range(1, len(dt)):
-        Fs[k] = _transition(dt[k], damping[k])
-        Qs[k] = np.diag(process_noise(settings, j, dt[k], damping[k]))
     both = scale[:, None] * scale
+    steps, which = np.unique(np.stack([dt, damping]), axis=1, return_inverse=True)  # most ticks share a few
+    Fs = [_transition(*step) * (scale[:, None] / scale) for step in steps.T]
+    Qs = [np.diag(process_noise(settings, j, *step)) * both for step in steps.T]
+    of_tick = which.ravel().tolist()
     x, P, _, _ = KalmanFilter(4, 1).rts_smoother(
-        mean * scale, cov * both, list(Fs * (scale[:, None] / scale)), list(Qs * both)
+        mean * scale, cov * both, [Fs[k] for k in of_tick], [Qs[k] for k in of_tick]
     )
     return x / scale, np.sqrt(np.stack([P[:, k, k] for k in range(2)], axis=1)) / scale[:2]
 
