@@ -221,6 +221,11 @@ def share_text(share: float, decimals: int = 1) -> str:
     return f"{value:.{decimals}f} %"
 
 
+def centimetres(metres: float) -> str:
+    """Formats a distance between surfaces, negative in overlap, rounded down: it is never told too large."""
+    return f"{math.floor(100.0 * metres + 1e-9)} cm".replace("-", "\u2212")
+
+
 def counted(number: int, what: str) -> str:
     """Formats a number with its noun: "1 tick", "1 200 ticks"."""
     return f"{number:,} {what}{'' if number == 1 else 's'}".replace(",", "\u202f")

@@ -15,7 +15,16 @@ from hrcreplay.reporting.metrics.contact import PERSONS, SHOWN_PARTS, method_pre
 from hrcreplay.reporting.metrics.fusion import add_limbs
 from hrcreplay.reporting.metrics.people import TRACKED
 from hrcreplay.reporting.metrics.series import Metric, MetricTable
-from hrcreplay.reporting.tables import PageTable, counted, limb_names_text, part_name_text, percent, share_text, text_of
+from hrcreplay.reporting.tables import (
+    PageTable,
+    centimetres,
+    counted,
+    limb_names_text,
+    part_name_text,
+    percent,
+    share_text,
+    text_of,
+)
 from hrcreplay.settings.sections import setting, with_new_names
 from hrcreplay.store.run_folder import Run
 
@@ -77,7 +86,7 @@ def _contact(metrics: Metrics, *, detailed: bool = False) -> str:
     elif near is None:
         words = "With this controller the robot would not have moved while anybody was known to be there"
     else:
-        kept = f"it kept {_centimetres(near)} away or more"
+        kept = f"it kept {centimetres(near)} away or more"
         if detailed:
             nearest = text_of(metrics["plan_body_distance_min_moving_m"])
             speed = text_of(metrics["plan_body_distance_min_moving_contact_speed_m_per_s"])
@@ -275,11 +284,6 @@ def _held_each(metrics: Metrics) -> str:
     return f" Until their horizon they held {each} of the ticks checked of each." if each else ""
 
 
-def _centimetres(metres: float) -> str:
-    """Formats a distance rounded down, so that it is never too large."""
-    return f"{int(100 * metres)} cm"
-
-
 def _pair(metrics: Metrics) -> str:
     link, limb, source = (
         metrics[f"plan_body_distance_min_moving_{part}"]["value"] for part in ("link", "limb", "source")
@@ -374,7 +378,7 @@ def in_short_as_it_ran(metrics: Metrics) -> str:
     elif near is None:
         words = "As it ran, the robot did not move while anybody was known to be there"
     else:
-        kept = f"it kept {_centimetres(near)} away or more"
+        kept = f"it kept {centimetres(near)} away or more"
         words = f"As it ran{_as_far_as(metrics)} the moving robot touched nobody: {kept}"
     return f"{words}.{_at_rest(metrics, RECORDED)}"
 

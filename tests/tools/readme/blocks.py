@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hrcreplay import limits
-from hrcreplay.reporting.tables import share_text
+from hrcreplay.reporting.tables import centimetres, share_text
 from tests.tools.readme.measurements import (
     BASELINES,
     HORIZONS_MS,
@@ -301,7 +301,7 @@ def _share(value: float | None) -> str:
 
 def _cm(value: float | None) -> str:
     """A distance between surfaces; negative in overlap."""
-    return "\u2013" if value is None else f"{100 * value:.0f} cm".replace("-", "\u2212")
+    return "\u2013" if value is None else centimetres(value)
 
 
 def _m3(value: float | None) -> str:
