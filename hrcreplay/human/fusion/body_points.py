@@ -138,7 +138,7 @@ def _compare_bone(filter_: Filter, c: int, now: int, side: int, bone: int, near:
     """Compares a thigh (bone 0) or shank (1) with the mean of the camera, and adds it or rules out what is below.
 
     A bone keeps its length; a skeleton that falls apart before the tracker loses it does not. A new length that stays
-    is learnt: it may be another opinion of the same leg.
+    may be another opinion of the same leg: it is believed, but not learnt, as the old one may come back.
 
     Args:
         filter_: Contains the frame; the mean lengths are changed.
@@ -154,12 +154,10 @@ def _compare_bone(filter_: Filter, c: int, now: int, side: int, bone: int, near:
     model, own = filter_.model, 2 * bone + side  # each leg for itself: a whole one does not vouch for the other
     length = distance(filter_.gate.points[c, LEG_POINTS[upper]], filter_.gate.points[c, LEG_POINTS[lower]])
     seen, mean = model.leg_bones_seen[c, own], model.leg_bones[c, own]
-    if seen >= _BONES_KNOWN:
-        if now - model.leg_bones_ns[c, own] > SHOWN_NS:  # not a skeleton that falls apart: another length
-            seen = 0
-        elif abs(length - mean) > BROKEN * mean:
+    if seen >= _BONES_KNOWN and abs(length - mean) > BROKEN * mean:
+        if now - model.leg_bones_ns[c, own] <= SHOWN_NS:  # later it is no skeleton that falls apart
             near[lower::2] = False
-            return
+        return
     seen = min(seen + 1, _BONES_MOST)
     model.leg_bones[c, own] = mean + (length - mean) / seen
     model.leg_bones_seen[c, own], model.leg_bones_ns[c, own] = seen, now
