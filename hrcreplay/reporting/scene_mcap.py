@@ -23,7 +23,7 @@ from hrcreplay.geometry.distances import nearest_pair
 from hrcreplay.human.model import skeleton
 from hrcreplay.records import JOINTS, LENGTHS, Floats
 from hrcreplay.reporting import scene_messages as parts
-from hrcreplay.reporting.metrics.series import times
+from hrcreplay.reporting.metrics.series import thin_path, times
 from hrcreplay.reporting.replay_scene import LinkMesh, MethodTrack, ReplayScene, at_rate, placements, pose_links
 from hrcreplay.reporting.scene_messages import ROBOT, WORLD, Rgba, bones, capsule, entity, lines, surface, timestamp
 
@@ -37,7 +37,11 @@ _OTHER: Rgba = (0.45, 0.50, 0.55, 0.35)
 _BODY: Rgba = (0.40, 0.63, 0.82, 1.0)
 _CAMERA: Rgba = (0.35, 0.60, 0.30, 0.8)
 _DISTANCE: Rgba = (0.48, 0.12, 0.64, 1.0)
+_PROGRAMMED: Rgba = (0.00, 0.45, 0.70, 1.0)
+_DRIVEN: Rgba = (0.84, 0.37, 0.00, 1.0)
 _BONE_M = 0.02
+#: Steps and thickness of a drawn path [m].
+_PATH_M = 0.005
 #: Depth of the drawn view of a camera [m].
 _VIEW_DEPTH_M = 0.35
 #: A message: topic, instant [ns], and content.
@@ -67,7 +71,7 @@ def write_scene(path: Path, scene: ReplayScene, measurements: pd.DataFrame | Non
         scene: The scene.
         measurements: Rows of measurements.parquet: the skeletons of the cameras; None without them.
     """
-    streams = [_description(scene), _robots(scene), _watched(scene), _objects(scene), _sights(scene)]
+    streams = [_description(scene), _robots(scene), _paths(scene), _watched(scene), _objects(scene), _sights(scene)]
     streams += [_transforms(scene), _joints(scene), _person(scene), _volumes(scene), _distances(scene)]
     streams += [_series(scene, name, track) for name, track in scene.methods.items()]
     streams += _cameras(measurements)
@@ -180,6 +184,20 @@ def _robots(scene: ReplayScene) -> Iterator[Message]:
                 for i, link in enumerate(scene.robot.links)
             ]
             yield where, t_ns, messages.SceneUpdate(entities=entities)
+
+
+def _paths(scene: ReplayScene) -> Iterator[Message]:
+    """Yields the programmed and the driven path of each method's TCP."""
+    t_ns = int(scene.t_ns[0])
+    for name, track in scene.methods.items():
+        entities = []
+        for what, points_m, rgba in (("programmed", track.ref_m, _PROGRAMMED), ("driven", track.tcp_m, _DRIVEN)):
+            known = thin_path(points_m[np.isfinite(points_m).all(axis=1)], _PATH_M)
+            if len(known) > 1:
+                ways = np.stack([known[:-1], known[1:]], axis=1)
+                entities.append(entity(t_ns, f"{what}, {name}", lines=[lines(np.round(ways, 4), _PATH_M, rgba)]))
+        if entities:
+            yield f"{_base(scene, name)}/path", t_ns, messages.SceneUpdate(entities=entities)
 
 
 def _frame(method: str, axis: int, suffix: str) -> str:

@@ -150,6 +150,21 @@ def test_each_number_over_time_has_the_one_type_of_its_schema(
             assert types[name] != "number" or np.isfinite(value), name  # JSON has no NaN
 
 
+def test_the_paths_are_those_of_the_tool(topics: dict[str, list[tuple[int, Any]]], scene: ReplayScene) -> None:
+    """Programmed and driven, of every method, as connected lines that leave the path by at most a step."""
+    for k, (name, track) in enumerate(scene.methods.items()):
+        ((t_ns, update),) = topics["/plan/path" if k == 0 else f"/baseline/{name}/path"]
+        assert t_ns == scene.t_ns[0]
+        assert [one.id for one in update.entities] == [f"programmed, {name}", f"driven, {name}"]
+        for one, path_m in zip(update.entities, (track.ref_m, track.tcp_m), strict=True):
+            corners = np.array([[p.x, p.y, p.z] for p in one.lines[0].points]).reshape(-1, 2, 3)
+            np.testing.assert_array_equal(corners[1:, 0], corners[:-1, 1])
+            known = path_m[np.isfinite(path_m).all(axis=1)]
+            np.testing.assert_allclose(corners[[0, -1], [0, 1]], known[[0, -1]], atol=1e-4)
+            off_m = [np.linalg.norm(corners.reshape(-1, 3) - point, axis=1).min() for point in known]
+            assert max(off_m) < 0.006
+
+
 def test_a_volume_is_drawn_on_hull_and_ball(topics: dict[str, list[tuple[int, Any]]], scene: ReplayScene) -> None:
     t_ns, update = topics["/volumes"][3]
     stored = np.flatnonzero(scene.volumes.t_ns == t_ns)
