@@ -1,4 +1,4 @@
-# hrcreplay on the command line, for a machine without Python 3.11 to 3.13. Building it needs a network, running it does not:
+# hrcreplay on the command line, for a machine without Python 3.11 to 3.14. Building it needs a network, running it does not:
 #   docker build -t hrcreplay .                                       (podman build -t hrcreplay . likewise)
 #   docker run --rm -v "$PWD:/data" --user "$(id -u):$(id -g)" hrcreplay report session.mcap --cell cell.toml
 FROM python:3.13-slim AS wheel
@@ -9,6 +9,8 @@ RUN pip install --no-cache-dir "hatchling>=1.26,<2" && python -m hatchling build
 RUN grep -E '^[a-zA-Z0-9].*==' requirements.lock | sed 's/ *\\$//' > /wheel/versions.txt
 
 FROM python:3.13-slim
+# What pinocchio needs of the system, and slim images lack.
+RUN apt-get update && apt-get install -y --no-install-recommends libgomp1 && rm -rf /var/lib/apt/lists/*
 COPY --from=wheel /wheel /wheel
 RUN pip install --no-cache-dir --only-binary :all: -c /wheel/versions.txt /wheel/*.whl
 # The kernels are compiled once, for the processor of the build; another processor compiles its own at the first run.

@@ -1,4 +1,4 @@
-# The two commands of the README are `make demo` and `make test`. Both need python3 (3.11 to 3.13) and nothing else.
+# The two commands of the README are `make demo` and `make test`. Both need python3 (3.11 to 3.14) and nothing else.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin

@@ -135,7 +135,7 @@ def test_the_capsule_that_is_proposed_guards_the_tool(text: str) -> None:
     setting = bare.unguarded_tool[bare.unguarded_tool.index("robot.tool_links") :].replace(" = ", "=", 1)
     guarded = build_robot(load_settings(None, (offset, setting)).robot, files, 0.5, AT_ORIGIN)
     assert guarded.unguarded_tool is None
-    assert guarded.segments[:-1] == bare.segments
+    assert repr(guarded.segments[:-1]) == repr(bare.segments)  # some volumes are NaN, which equals nothing
     q = np.linspace(0.1, 0.6, guarded.nv)
     tcp, ends = guarded.pose(q, q).T_world_tcp[:3, 3], guarded.ends_m(q)[-1]
     assert_allclose(ends[1], tcp, atol=1e-3)
