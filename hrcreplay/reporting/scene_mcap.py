@@ -23,7 +23,7 @@ from hrcreplay.geometry.distances import nearest_pair
 from hrcreplay.human.model import skeleton
 from hrcreplay.records import JOINTS, LENGTHS, Floats
 from hrcreplay.reporting import scene_messages as parts
-from hrcreplay.reporting.metrics.series import thin_path, times
+from hrcreplay.reporting.metrics.series import thin_stretches, times
 from hrcreplay.reporting.replay_scene import LinkMesh, MethodTrack, ReplayScene, at_rate, placements, pose_links
 from hrcreplay.reporting.scene_messages import ROBOT, WORLD, Rgba, bones, capsule, entity, lines, surface, timestamp
 
@@ -192,9 +192,9 @@ def _paths(scene: ReplayScene) -> Iterator[Message]:
     for name, track in scene.methods.items():
         entities = []
         for what, points_m, rgba in (("programmed", track.ref_m, _PROGRAMMED), ("driven", track.tcp_m, _DRIVEN)):
-            known = thin_path(points_m[np.isfinite(points_m).all(axis=1)], _PATH_M)
-            if len(known) > 1:
-                ways = np.stack([known[:-1], known[1:]], axis=1)
+            known = thin_stretches(points_m, _PATH_M)
+            ways = np.concatenate([np.stack([one[:-1], one[1:]], axis=1) for one in known] or [np.empty((0, 2, 3))])
+            if len(ways):
                 entities.append(entity(t_ns, f"{what}, {name}", lines=[lines(np.round(ways, 4), _PATH_M, rgba)]))
         if entities:
             yield f"{_base(scene, name)}/path", t_ns, messages.SceneUpdate(entities=entities)

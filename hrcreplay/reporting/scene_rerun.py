@@ -18,7 +18,7 @@ from hrcreplay.geometry.distances import nearest_pair
 from hrcreplay.human.model import skeleton
 from hrcreplay.records import JOINTS, LENGTHS, POINTS, Floats
 from hrcreplay.reporting.figures.drawing import BONES
-from hrcreplay.reporting.metrics.series import thin_path, times
+from hrcreplay.reporting.metrics.series import thin_stretches, times
 from hrcreplay.reporting.replay_scene import MethodTrack, ReplayScene, at_rate, placements, pose_links
 from hrcreplay.reporting.scene_messages import surface_mesh, upright_to, whole_surface
 from hrcreplay.reporting.tables import part_name_text
@@ -185,9 +185,8 @@ def _capsule_fields(ends_m: Floats, radius_m: Floats) -> dict[str, Any]:
 def _log_paths(recording: Any, method: str, track: MethodTrack) -> None:
     """Logs the programmed and the driven path of the TCP."""
     for name, points_m, colour in (("programmed", track.ref_m, _PROGRAMMED), ("driven", track.tcp_m, _DRIVEN)):
-        points_m = points_m[np.isfinite(points_m).all(axis=1)]
-        if len(points_m):
-            line = rr.LineStrips3D([thin_path(points_m, 0.005)], colors=[colour], radii=[0.003])
+        if stretches := thin_stretches(points_m, 0.005):
+            line = rr.LineStrips3D(stretches, colors=[colour], radii=[0.003])
             recording.log(f"world/paths/{_word(method)}/{name}", line, static=True)
 
 

@@ -83,3 +83,15 @@ def test_thinned_path_stays_within_its_tolerance() -> None:
     assert (thin[0] == circle[0]).all()
     assert (thin[-1] == circle[-1]).all()
     assert np.linalg.norm(np.diff(thin, axis=0), axis=1).max() < 0.012
+
+
+def test_no_line_of_a_path_crosses_a_gap() -> None:
+    points = np.column_stack([np.arange(12.0), np.zeros(12), np.zeros(12)])
+    points[[3, 4, 8]] = np.nan
+    first, second, third = series.thin_stretches(points, 1e-3)
+    assert [part[:, 0].tolist() for part in (first, second, third)] == [
+        [0.0, 1.0, 2.0],
+        [5.0, 6.0, 7.0],
+        [9.0, 10.0, 11.0],
+    ]
+    assert series.thin_stretches(points[3:5], 1e-3) == []

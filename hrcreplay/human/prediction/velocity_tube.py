@@ -42,6 +42,9 @@ for _limb, _carrying in enumerate(((0, 1), (1,), (1, 2), (1, 2, 3), (1, 4), (1, 
     _CARRIED_BY[_limb, _carrying] = True
 #: Speed above which the bound on a limb's departure grows no further [m/s].
 FASTEST_M_PER_S = 1.0
+#: Minimum distance of the legs from where they are shown, while the residual of their person is unknown: in the first
+#: second trackers put legs that they do not see elsewhere, by as much as this [m].
+_LEGS_UNKNOWN_M = 0.55
 #: Speeds at which people walk and reach, ISO 13855; of each limb of BODY [m/s].
 WALKING_M_PER_S, HAND_M_PER_S = 1.6, 2.0
 PEOPLES_SPEEDS = np.array([HAND_M_PER_S if limb in LIMBS[2:] else WALKING_M_PER_S for limb in BODY])
@@ -150,7 +153,9 @@ def _tube_rows(
                 # the residual of the legs is not related to departures
                 of = THORAX if limb == LEGS else limb
                 own = residual_m[i, of]
-                found.residual[i, limb] = unknown_m + displaced[of] if np.isnan(own) else own
+                if np.isnan(own):
+                    own = max(unknown_m, _LEGS_UNKNOWN_M) if limb == LEGS else unknown_m + displaced[of]
+                found.residual[i, limb] = own
         if not np.isnan(unknown_m):
             found.legs_m[i] = residual_m[i, LEGS]
 

@@ -164,6 +164,13 @@ def thin_path(points: Floats, tolerance: float) -> Floats:
     return points[np.union1d(first, [len(points) - 1])]
 
 
+def thin_stretches(points: Floats, tolerance: float) -> list[Floats]:
+    """Returns the stretches of a path (n, d) between its unknown points, each thinned: no line crosses a gap."""
+    known = np.isfinite(points).all(axis=1)
+    edges = np.flatnonzero(np.diff(known, prepend=False, append=False)).reshape(-1, 2)
+    return [thin_path(points[first:last], tolerance) for first, last in edges.tolist()]
+
+
 #: Edge of the cells in which vertices of a path are searched together, and distance below which vertices are merged
 #: [m].
 _CELL_M, _SAME_M = 2e-4, 1e-6

@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from hrcreplay import limits
 from hrcreplay.reporting.tables import centimetres, share_text
 from tests.tools.readme.measurements import (
@@ -172,6 +174,9 @@ def people(facts: Facts) -> str:
             rows[-1][-len(beside) :] = [_m3(own[0][name][-1]) for name in beside]
     pooled = [f"{_share(one['share'])} ({_share(one['low'])} to {_share(one['high'])})" for one in found["unknown"]]
     together = "recordings together, demo and simulated people not (95 % interval)"
+    true = [log for log in found["logs"] if not log["group"].startswith("simulated")]
+    means = [_m3(float(size)) for size in np.mean([log["union_m3"] for log in true], axis=0)]
+    means += [_m3(float(np.mean([log[name][-1] for log in true]))) for name in beside]
     rest = [share for limb in found["of_recordings"]["at_rest"].values() for share in limb]
     widened = ", ".join(f"{factor:g}" for factor in found["widened"])
     words = (
@@ -179,7 +184,8 @@ def people(facts: Facts) -> str:
         f"Of the bounds on limbs at rest the recordings without ground truth alone give {_share(min(rest))} to "
         f"{_share(max(rest))}, {_share(sum(rest) / len(rest))} in the mean; the rest comes from simulated people."
     )
-    return f"{_table(head, [*rows, [together, *pooled, *[''] * len(beside)]])}\n\n{_wrapped(words)}"
+    last = [[together, *pooled, *[""] * len(beside)], ["mean of these recordings", *means]]
+    return f"{_table(head, [*rows, *last])}\n\n{_wrapped(words)}"
 
 
 def misses(facts: Facts) -> str:
