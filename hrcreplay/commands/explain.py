@@ -62,8 +62,9 @@ class Record:
 
     def __post_init__(self) -> None:
         axes = range(1, 1 + sum(name[0] == "u" and name[1:].isdigit() for name in self.motion.columns))
-        self._q, self._dq, self._u = (
-            self.motion[[f"{name}{i}" for i in axes]].to_numpy(dtype=float) for name in ("q", "dq", "u")
+        self._q, self._dq, self._u = (  # row by row, as everywhere else: kernels are compiled anew for other layouts
+            np.ascontiguousarray(self.motion[[f"{name}{i}" for i in axes]].to_numpy(dtype=float))
+            for name in ("q", "dq", "u")
         )
         self._status = self.motion["status"].astype(str).to_numpy()
         self.states = HumanStates.join(list(read_states(self.folder / "state.parquet", 4096)))
