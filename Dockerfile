@@ -9,7 +9,7 @@ RUN pip install --no-cache-dir "hatchling>=1.26,<2" && python -m hatchling build
 RUN grep -E '^[a-zA-Z0-9].*==' requirements.lock | sed 's/ *\\$//' > /wheel/versions.txt
 
 FROM python:3.13-slim
-# What pinocchio needs of the system, and slim images lack.
+# What pinocchio needs of the system; not every base has it.
 RUN apt-get update && apt-get install -y --no-install-recommends libgomp1 && rm -rf /var/lib/apt/lists/*
 COPY --from=wheel /wheel /wheel
 RUN pip install --no-cache-dir --only-binary :all: -c /wheel/versions.txt /wheel/*.whl
