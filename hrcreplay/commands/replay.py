@@ -9,8 +9,8 @@ import math
 import os
 import time
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import Executor, Future
+from collections.abc import Iterable, Mapping
+from concurrent.futures import Executor
 from contextlib import ExitStack
 from datetime import UTC, datetime
 from importlib import resources
@@ -22,7 +22,9 @@ import pyarrow.parquet as pq
 from hrcreplay.commands.notes import notes_of
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.pipeline import assembly, reuse, stages
+from hrcreplay.pipeline.fusion_stage import SeenBodies
 from hrcreplay.pipeline.kernel_build import ensure_compiled
+from hrcreplay.pipeline.methods_elsewhere import MethodsElsewhere
 from hrcreplay.pipeline.progress import NO_PROGRESS, Progress, ProgressBar, print_note
 from hrcreplay.pipeline.robot_mass import robot_mass
 from hrcreplay.pipeline.run_config import RunConfig, RunOptions, resolve
@@ -100,7 +102,8 @@ def execute(
         reused = reuse.take_over(run_config, parts, writer, smooth=smooth)
         for stage in [stage for stage in run_config.stages if stage not in reused][-1:]:
             bar.begin(stage, len(ticks_ns))
-        sink = Sink(writer, Stopwatch(time.perf_counter_ns), bar.advance)
+        seen = SeenBodies() if run_config.command == "report" and "fuse" not in reused else None
+        sink = Sink(writer, Stopwatch(time.perf_counter_ns), bar.advance, seen=seen)
         compared = run_config.command == "report" and not log.header.has_truth  # this then includes the smoothed person
         two = processes > 1 and len(ticks_ns) >= MANY and "plan" in run_config.stages
         second = held.enter_context(second_process()) if two else None
@@ -108,7 +111,7 @@ def execute(
         told = run_stages(run_config, log, ticks_ns, chunk_ticks, sink, reused, **how)
         found = findings(run_config, told, reused)
         meta = {**known, **found, **describe_run(run_config, began, parts, smooth=smooth)}
-        complete(run_config, log, writer, sink.watch, meta, bar, second)
+        complete(run_config, log, writer, sink.watch, meta, bar, second, seen)
         return writer.folder
 
 
@@ -137,6 +140,7 @@ def complete(
     meta: dict[str, Any],
     progress: Progress = NO_PROGRESS,
     second: Executor | None = None,
+    seen: SeenBodies | None = None,
 ) -> None:
     """Completes a run whose stages have written their tables; also makes the report if requested.
 
@@ -148,6 +152,7 @@ def complete(
         meta: Entries of run.json so far.
         progress: Receives the progress.
         second: A second process; None: no such process.
+        seen: The bodies that stage 1 saw; None: it was not run, and the log is read again for them.
     """
     base = assembly.known_robot_base(run_config, log)
     if log.header.joint_topics or meta["counts"].get("joint_gaps_ms"):
@@ -158,7 +163,7 @@ def complete(
         print_note(line)
     meta["T_world_base"] = None if base is None else base.tolist()
     if run_config.command == "report":
-        _report(run_config, log, writer, watch, meta, progress, second)
+        _report(run_config, log, writer, watch, meta, progress, second, seen)
     writer.timing.update(watch.summary(1.0 / run_config.settings.fusion.rate_hz))
     writer.finish(meta)
 
@@ -171,6 +176,7 @@ def _report(
     meta: dict[str, Any],
     progress: Progress,
     second: Executor | None,
+    seen: SeenBodies | None,
 ) -> None:
     """Writes the contact table and the report of a run whose other tables are written."""
     from hrcreplay.commands.report import write_report
@@ -181,7 +187,7 @@ def _report(
     ticks = pq.read_metadata(writer.partial / "state.parquet").num_rows
     progress.begin("contact")
     with watch.stage("contact", ticks):
-        write_contact(run_config, log, writer, assembly.robot_base(run_config, log), second)
+        write_contact(run_config, log, writer, assembly.robot_base(run_config, log), second, seen)
     with watch.stage("report", ticks):
         write_report(run_config, writer, meta, log, progress)
 
@@ -209,7 +215,7 @@ def run_stages(
         reused: Stages whose tables were copied from an earlier run.
         folder: Folder of those tables.
         smooth: True: also write the smoothed person.
-        second: A second process, which moves the robot by the baselines; None: no such process.
+        second: A second process, which moves the robot by the baselines and stores volumes; None: no such process.
 
     Returns:
         The findings of the stages that read the log.
@@ -222,7 +228,7 @@ def run_stages(
     else:
         states = read_states(folder / "state.parquet", size)
     flow: Iterable[Any] = states
-    elsewhere: Future[dict[str, Any]] | None = None
+    elsewhere: MethodsElsewhere | None = None
     if "plan" in todo:
         robot = assembly.robot(run_config, assembly.robot_base(run_config, log))
         programme = assembly.programme(run_config, log, robot)
@@ -231,11 +237,10 @@ def run_stages(
         sink.notes["plan"].extend(assembly.scene_notes(run_config, log, moved))
         every = stages.store_every(run_config) if "predict" in todo else math.inf
         others = [name for name, one in moved.items() if not one.chosen and name != RECORDED]
-        if second is not None and others:
-            task = run_config, ticks_ns, size, others, folder
-            elsewhere = second.submit(follow_methods, *task, fused_before="fuse" not in todo)
+        if second is not None:
+            elsewhere = MethodsElsewhere(second, run_config, int(ticks_ns[0]), others, folder)
             moved = {name: one for name, one in moved.items() if name not in others}
-        flow = stages.plan_batches(states, assembly.surroundings(run_config, robot), moved, every, sink)
+        flow = stages.plan_batches(states, assembly.surroundings(run_config, robot), moved, every, sink, elsewhere)
     elif "predict" in todo:
         every = stages.store_every(run_config)
         flow = stages.predict_batches(states, assembly.prediction_stage(run_config), every, sink)
@@ -243,57 +248,8 @@ def run_stages(
         for _ in flow:
             pass
     if elsewhere is not None:
-        sink.watch.calls.update(elsewhere.result())
+        sink.watch.calls.update(elsewhere.finish())
     return {"fuse": collect_fusion_findings(log, sink), "plan": collect_plan_findings(log, sink)}
-
-
-class _MotionsAlone:
-    """Writes the tables of motions into a folder, and drops the rest."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder, self._tables = folder, dict[str, run_folder.TableWriter]()
-
-    def table(self, name: str, columns: Mapping[str, Any], /) -> None:
-        """Appends rows to the table of a motion."""
-        if name.startswith("motion_"):
-            if name not in self._tables:
-                self._tables[name] = run_folder.TableWriter(self._folder / f"{name}.parquet")
-            self._tables[name].write(columns)
-
-    def close(self) -> None:
-        """Completes the tables."""
-        for table in self._tables.values():
-            table.close()
-
-
-def follow_methods(
-    run_config: RunConfig, ticks_ns: Ints, size: int, names: Sequence[str], folder: Path, *, fused_before: bool
-) -> dict[str, list[tuple[int, int]]]:
-    """Moves the robot by some methods of a run, in a process that fuses the people for itself, as that is fast.
-
-    Args:
-        run_config: The run.
-        ticks_ns: (n,) ticks of the run [ns].
-        size: Ticks of a batch.
-        names: The methods; none is the chosen one.
-        folder: Receives the tables of their motions.
-        fused_before: True: the folder already has state.parquet.
-
-    Returns:
-        Stage -> ticks and duration [ns] of each call.
-    """
-    log, tables = open_log(run_config.log, run_config.settings.logs), _MotionsAlone(folder)
-    sink = Sink(tables, Stopwatch(time.perf_counter_ns), NO_PROGRESS.advance)
-    states: Iterable[HumanStates] = read_states(folder / "state.parquet", size)
-    if not fused_before:
-        states = stages.fuse_batches(log, ticks_ns, size, assembly.fusion_stage(run_config, log), sink)
-    robot = assembly.robot(run_config, assembly.robot_base(run_config, log))
-    moved = assembly.followers(run_config, assembly.programme(run_config, log, robot), int(ticks_ns[0]))
-    some = {name: moved[name] for name in names}
-    for _ in stages.plan_batches(states, assembly.surroundings(run_config, robot), some, math.inf, sink):
-        pass
-    tables.close()
-    return {name: calls for name, calls in sink.watch.calls.items() if name.startswith("plan ")}
 
 
 def _describe_results(

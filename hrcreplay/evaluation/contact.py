@@ -27,6 +27,7 @@ from hrcreplay.geometry.distances import nearest_pair, protrusion_m
 from hrcreplay.human.model import LEG_PARTS, PARTS, part_radii
 from hrcreplay.logs.reader import Log
 from hrcreplay.pipeline import assembly, stages
+from hrcreplay.pipeline.fusion_stage import SeenBodies
 from hrcreplay.pipeline.person_fuser import PersonFuser
 from hrcreplay.pipeline.run_config import RunConfig
 from hrcreplay.pipeline.surroundings import PredictionStage
@@ -52,13 +53,16 @@ _BODY_HZ = 25.0
 Volumes = Mapping[str, SweptVolume]
 
 
-def read_recorded_people(run_config: RunConfig, log: Log, writer: RunWriter) -> RecordedPeople:
+def read_recorded_people(
+    run_config: RunConfig, log: Log, writer: RunWriter, seen: SeenBodies | None = None
+) -> RecordedPeople:
     """Reads all people in the log of a run; writes smooth.parquet if it and the ground truth are missing.
 
     Args:
         run_config: The run.
         log: Log of the run.
         writer: Run folder with complete tables.
+        seen: The bodies that stage 1 saw; None: the log is read again for them.
     """
     parts = read_states(writer.partial / "state.parquet", _BATCH)
     ticks_ns = np.concatenate([states.ticks()[0] for states in parts])
@@ -72,7 +76,7 @@ def read_recorded_people(run_config: RunConfig, log: Log, writer: RunWriter) -> 
             writer.close_tables()
         return HumanStates.join(list(read_states(path, _BATCH)))
 
-    return read_people(log, ticks_ns, fusion_stage, smoothed)
+    return read_people(log, ticks_ns, fusion_stage, smoothed, seen)
 
 
 def _smooth(run_config: RunConfig, log: Log, ticks_ns: Ints) -> Iterator[HumanStates]:
@@ -87,7 +91,12 @@ def _smooth(run_config: RunConfig, log: Log, ticks_ns: Ints) -> Iterator[HumanSt
 
 
 def write_contact(
-    run_config: RunConfig, log: Log, writer: RunWriter, T_world_base: Floats, second: Executor | None = None
+    run_config: RunConfig,
+    log: Log,
+    writer: RunWriter,
+    T_world_base: Floats,
+    second: Executor | None = None,
+    seen: SeenBodies | None = None,
 ) -> None:
     """Writes contact.parquet and severity.parquet for every motion of a run, and the recorded body for drawing.
 
@@ -97,8 +106,9 @@ def write_contact(
         writer: Run folder with complete tables.
         T_world_base: (4, 4) robot base in the world.
         second: A second process, which takes the motions other than the chosen one; None: no such process.
+        seen: The bodies that stage 1 saw; None: the log is read again for them.
     """
-    people = read_recorded_people(run_config, log, writer)
+    people = read_recorded_people(run_config, log, writer, seen)
     judged = _JudgedRun(run_config, T_world_base, people, writer.partial)
     paths = sorted(writer.partial.glob("motion*.parquet"))
     full = judged.full if second is None else second.submit(judged.full).result

@@ -16,7 +16,7 @@ from hrcreplay.errors import LogError
 from hrcreplay.human.fusion import fuse, inverse_kinematics
 from hrcreplay.human.model import part_axes, skeleton
 from hrcreplay.logs.reader import Log
-from hrcreplay.pipeline.fusion_stage import FusionStage
+from hrcreplay.pipeline.fusion_stage import FusionStage, SeenBodies, as_frames
 from hrcreplay.pipeline.person_fuser import PersonFuser
 from hrcreplay.pipeline.stages import PeopleSmoother, batches
 from hrcreplay.records import (
@@ -207,7 +207,11 @@ def _find_seen(states: HumanStates, memory_s: float) -> Bools:
 
 
 def read_people(
-    log: Log, ticks_ns: Ints, fusion_stage: FusionStage, smoothed_states: Callable[[], HumanStates]
+    log: Log,
+    ticks_ns: Ints,
+    fusion_stage: FusionStage,
+    smoothed_states: Callable[[], HumanStates],
+    bodies: SeenBodies | None = None,
 ) -> RecordedPeople:
     """Reads all people in a log within a span.
 
@@ -216,16 +220,11 @@ def read_people(
         ticks_ns: (n,) ticks of the span, increasing [ns].
         fusion_stage: Cameras, and settings of stage 1.
         smoothed_states: Returns the smoothed states of these ticks; called for people without ground truth.
+        bodies: The bodies that stage 1 saw in the span; None: it is run again for them.
     """
-    fuser, parts, bodies = PersonFuser(replace(fusion_stage, watched=None), log.header.cameras), [], []
-    for ticks, due in batches(log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1), ticks_ns, _BATCH):
-        if due is None and fusion_stage.people == "nearest":
-            continue
-        _, found = fuser.update(ticks, due)
-        parts.append(found.measured)
-        bodies.append(found.others)
-    seen = Measurements.join(parts) if parts else None
-    others = CameraFrames.join(bodies) if bodies else None
+    bodies = _see_bodies(log, ticks_ns, fusion_stage) if bodies is None else bodies
+    seen = CameraFrames.join(bodies.people) if bodies.people else None
+    others = CameraFrames.join(bodies.others) if bodies.others else None
     truth = _truth(log, ticks_ns)
     of_truth = 1 if truth is None or seen is None else _nearest_to(truth, seen)
     people = []
@@ -235,34 +234,43 @@ def read_people(
     best = smoothed_states() if rest else None
     for number in rest:
         own = best.of_person(number) if best is not None else None
-        mine = None if seen is None else _rows_of(seen, number)
+        mine = None if seen is None else seen.rows(seen.body == number)
         if own is not None and mine is not None and number > 1:  # bodies that were not yet a person
             known = np.isfinite(own.p[:, 0])
             since_ns = int(own.t_ns[known][0]) if known.any() else 2**62
             early = mine.capture_ns < since_ns
-            others = CameraFrames.join([*([] if others is None else [others]), _as_frames(mine.rows(early), number)])
+            others = CameraFrames.join([*([] if others is None else [others]), mine.rows(early)])
             mine = mine.rows(~early)
             if not known.any():
                 continue
         if own is not None:
             people.append(_recorded_person(number, mine, own, fusion_stage))
     if truth is not None:
-        chosen = [] if seen is None else [_as_frames(_rows_of(seen, of_truth), _CHOSEN)]
+        chosen = [] if seen is None else [_renamed(seen.rows(seen.body == of_truth), _CHOSEN)]
         tracks = _people_off(truth, [*chosen, *([] if others is None else [others])], fusion_stage)
     else:
         tracks = tuple(_tracks_of(others, fusion_stage)) if others is not None else ()
     return RecordedPeople(tuple(sorted(people, key=lambda one: one.number)), tracks)
 
 
-def _numbers(seen: Measurements | None) -> list[int]:
-    return sorted({1, *seen.numbers.tolist()}) if seen is not None else [1]
+def _see_bodies(log: Log, ticks_ns: Ints, fusion_stage: FusionStage) -> SeenBodies:
+    """Runs stage 1 for the bodies in a span."""
+    fuser, bodies = PersonFuser(replace(fusion_stage, watched=None), log.header.cameras), SeenBodies()
+    for ticks, due in batches(log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1), ticks_ns, _BATCH):
+        if due is not None or fusion_stage.people != "nearest":
+            bodies.add(fuser.update(ticks, due)[1])
+    return bodies
 
 
-def _rows_of(seen: Measurements, number: int) -> Measurements:
-    return replace(seen.rows(seen.numbers == number), person=None)
+def _renamed(bodies: CameraFrames, body: int) -> CameraFrames:
+    return replace(bodies, body=np.full(len(bodies), body))
 
 
-def _nearest_to(truth: BodyTrack, seen: Measurements) -> int:
+def _numbers(seen: CameraFrames | None) -> list[int]:
+    return sorted({1, *seen.body.tolist()}) if seen is not None else [1]
+
+
+def _nearest_to(truth: BodyTrack, seen: CameraFrames) -> int:
     """Number of the person whom the ground truth shows: the nearest to it in the median."""
     there = at_instants(truth.t_ns, truth.points_m, seen.capture_ns, GAP_S)
     off = np.linalg.norm(seen.points_m - there, axis=2)
@@ -271,13 +279,13 @@ def _nearest_to(truth: BodyTrack, seen: Measurements) -> int:
     found = {
         number: float(np.median(apart_m[rows]))
         for number in _numbers(seen)
-        if (rows := (seen.numbers == number) & known.any(axis=1)).any()
+        if (rows := (seen.body == number) & known.any(axis=1)).any()
     }
     return min(found, key=lambda number: (found[number], number), default=1)
 
 
 def _recorded_person(
-    number: int, seen: Measurements | None, best: HumanStates, fusion_stage: FusionStage
+    number: int, seen: CameraFrames | None, best: HumanStates, fusion_stage: FusionStage
 ) -> RecordedPerson:
     """A person without ground truth: the smoothed states and the believed points of each camera."""
     smoothed = from_states(best, fusion_stage.filter.memory_s)
@@ -292,19 +300,6 @@ def _recorded_person(
         if np.isfinite(points[mine]).any()
     ]
     return RecordedPerson(number, source, t_ns, points_m, (smoothed, *cameras))
-
-
-def _as_frames(seen: Measurements, body: int) -> CameraFrames:
-    """Measurements as frames with their points in the world and a body id."""
-    return CameraFrames(
-        seen.capture_ns,
-        seen.arrival_ns,
-        seen.camera,
-        np.full(len(seen), body),
-        seen.points_m,
-        seen.confidence,
-        seen.cameras,
-    )
 
 
 def _truth(log: Log, ticks_ns: Ints) -> BodyTrack | None:
@@ -407,7 +402,7 @@ def read_recordings(
             best += smoother.add(states, trace)
     fused, measurements = HumanStates.join(passed), Measurements.join(seen)
     smoothed = fused if truth is not None else HumanStates.join([*best, *smoother.finish()])
-    of_truth = 0 if truth is None else _nearest_to(truth, measurements)
+    of_truth = 0 if truth is None else _nearest_to(truth, as_frames(measurements))
     known = np.isfinite(fused.p[:, 0])
     found = {}
     for number in sorted(set(fused.numbers[known].tolist())) or [1]:
@@ -417,7 +412,7 @@ def read_recordings(
             whole = _plain(log, counts)
             found[number] = Recording(states, truth.t_ns, truth.points_m, truth.t_ns, joints, TRUTH, whole)
             continue
-        mine = _rows_of(measurements, number)
+        mine = measurements.rows(measurements.numbers == number)
         points, rejected = _select_accepted(mine, own, fusion_stage)
         source, t_ns, points_m = _recorded_points(mine, points, own)
         whole = _plain(log, counts + rejected)
@@ -425,7 +420,7 @@ def read_recordings(
     return found
 
 
-def _recorded_points(seen: Measurements, points: Floats, best: HumanStates) -> tuple[str, Ints, Floats]:
+def _recorded_points(seen: Measurements | CameraFrames, points: Floats, best: HumanStates) -> tuple[str, Ints, Floats]:
     """Returns source, instants and points of the person: accepted camera points, else the smoothed person."""
     if not np.isfinite(points).any():
         return SMOOTHED, best.t_ns, skeleton(best.p, best.lengths_m)
@@ -467,7 +462,9 @@ def fuse_stretches(
         raise LogError(f"{log.header.path}: no camera saw anybody; an audit needs a person")
 
 
-def _select_accepted(seen: Measurements, best: HumanStates, fusion_stage: FusionStage) -> tuple[Floats, Counter[str]]:
+def _select_accepted(
+    seen: Measurements | CameraFrames, best: HumanStates, fusion_stage: FusionStage
+) -> tuple[Floats, Counter[str]]:
     """Returns the accepted measured points (m, 20, 3), and the number of other points per camera and reason.
 
     A missing point or one with confidence 0 counts as not seen. A point counts as doubted if its confidence is too low,
@@ -500,7 +497,7 @@ def _select_accepted(seen: Measurements, best: HumanStates, fusion_stage: Fusion
     return np.where((good & measured)[..., None], seen.points_m, np.nan), _count_rejected(seen, measured, good, jumped)
 
 
-def _count_rejected(seen: Measurements, measured: Bools, good: Bools, jumped: Bools) -> Counter[str]:
+def _count_rejected(seen: Measurements | CameraFrames, measured: Bools, good: Bools, jumped: Bools) -> Counter[str]:
     """Counts, per camera, the points not seen, doubted and jumping, and the frames with a jumping point."""
     counts: Counter[str] = Counter()
     for c, camera in enumerate(seen.cameras):

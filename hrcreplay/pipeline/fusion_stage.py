@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -33,6 +33,35 @@ class Sightings(NamedTuple):
     def others(self) -> CameraFrames:
         """Bodies that are none of the people."""
         return self.everybody.rows((self.person == 0) & (self.everybody.body != NOBODY))
+
+
+@dataclass
+class SeenBodies:
+    """All bodies that cameras show in a run, from which the recorded people are made."""
+
+    people: list[CameraFrames] = field(default_factory=list)  #: of the people, their number as body id
+    others: list[CameraFrames] = field(default_factory=list)  #: all others
+
+    def add(self, sightings: Sightings) -> None:
+        """Adds those of some frames; points in the world."""
+        measured, others = sightings.measured, sightings.others
+        if len(measured):
+            self.people.append(as_frames(measured))
+        if len(others):
+            self.others.append(others)
+
+
+def as_frames(measured: Measurements) -> CameraFrames:
+    """Measurements as frames, their points in the world, with the number of the person as body id."""
+    return CameraFrames(
+        capture_ns=measured.capture_ns,
+        arrival_ns=measured.arrival_ns,
+        camera=measured.camera,
+        body=measured.numbers,
+        points_m=measured.points_m,
+        confidence=measured.confidence,
+        cameras=measured.cameras,
+    )
 
 
 @dataclass(frozen=True)

@@ -13,12 +13,12 @@ import numpy as np
 from hrcreplay.calibration.clock_check import ClockCheck
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.geometry.inflated_hull import InflatedHull
-from hrcreplay.human.fusion import fuse, inverse_kinematics, vacancy
+from hrcreplay.human.fusion import fuse, inverse_kinematics, smoother, vacancy
 from hrcreplay.logs.camera_checks import CameraChecks
 from hrcreplay.logs.clocks import delay_text
 from hrcreplay.logs.reader import Log
 from hrcreplay.pipeline.assembly import Follower
-from hrcreplay.pipeline.fusion_stage import FusionStage
+from hrcreplay.pipeline.fusion_stage import FusionStage, SeenBodies
 from hrcreplay.pipeline.person_fuser import PersonFuser
 from hrcreplay.pipeline.run_config import RunConfig
 from hrcreplay.pipeline.surroundings import Forecast, PredictionStage, Surroundings
@@ -87,6 +87,7 @@ class Sink:
     progress: Callable[[str, int], None]  #: stage, ticks done
     counts: Counter[str] = field(default_factory=Counter)
     notes: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))  #: stage -> notes on it
+    seen: SeenBodies | None = None  #: receives the bodies that cameras show; None: they are not asked for
 
 
 def collect_fusion_findings(log: Log, sink: Sink) -> Told:
@@ -188,7 +189,7 @@ def fuse_batches(
     fuser = PersonFuser(fusion_stage, log.header.cameras, traced=smooth)
     watched = fusion_stage.watched is not None
     frames = log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1, nobody=watched)
-    smoother = PeopleSmoother(fusion_stage.filter)
+    people = PeopleSmoother(fusion_stage.filter)
     checks = PeopleChecks(log.header.cameras)
     clocks = ClockCheck(log.header.cameras, fusion_stage.T_world_camera, int(ticks_ns[0]), int(ticks_ns[-1]))
     ever = False
@@ -202,8 +203,10 @@ def fuse_batches(
         if seen is not None:
             sink.tables.table("measurements", measurement_columns(sightings.measured))
             checks.add(sightings.measured)
+            if sink.seen is not None:
+                sink.seen.add(sightings)
         if smooth:
-            for part in smoother.add(states, trace):
+            for part in people.add(states, trace):
                 sink.tables.table("smooth", state_columns(part))
         sink.counts.update(sightings.counts)
         sink.counts.update(events)
@@ -221,7 +224,7 @@ def fuse_batches(
     sink.notes["fuse"].extend(_describe_area(log, fuser.area, sink.counts) if watched else ())
     sink.notes["fuse"].extend(_describe_others(sink.counts))
     if smooth:
-        for part in smoother.finish():
+        for part in people.finish():
             sink.tables.table("smooth", state_columns(part))
 
 
@@ -416,7 +419,7 @@ class StretchSmoother:
         states = HumanStates.join([part for part, _ in self._parts])
         trace = fuse.Trace.join([part for _, part in self._parts])
         known = slice(0, count + self.LATER)
-        smoothed = fuse.smooth(states.rows(known), trace.rows(known), self._settings).rows(slice(0, count))
+        smoothed = smoother.smooth(states.rows(known), trace.rows(known), self._settings).rows(slice(0, count))
         self._parts = [(states.rows(slice(count, None)), trace.rows(slice(count, None)))]
         self._count -= count
         return smoothed
@@ -531,12 +534,19 @@ def predict_batches(
         with sink.watch.stage("predict", len(ticks)):
             volumes = prediction_stage.volumes(batch)
         rows = np.concatenate([np.arange(first[tick], first[tick + 1]) for tick in stored] or [stored])
-        with sink.watch.stage("hulls", len(stored)):
+        with sink.watch.stage("hulls", len(ticks)):
             horizon_s = np.full(len(batch), prediction_stage.horizon_s)
             store_volumes(volumes, rows, horizon_s, sink.tables, batch.person)
         done += len(ticks)
         sink.progress("predict", len(ticks))
         yield batch
+
+
+class Elsewhere(Protocol):
+    """Where the other methods of a run move the robot, and where its volumes are stored."""
+
+    def take(self, batch: HumanStates, stored: Ints, horizon_s: Floats) -> None:
+        """Takes a batch of the fused people, and the ticks whose volumes are stored with the horizon of each [s]."""
 
 
 def plan_batches(
@@ -545,6 +555,7 @@ def plan_batches(
     planners: Mapping[str, Follower],
     store_every: float,
     sink: Sink,
+    elsewhere: Elsewhere | None = None,
 ) -> Iterator[None]:
     """Stages 2 and 3: computes the robot's motion by each method; each method requests the volumes that it needs.
 
@@ -556,30 +567,58 @@ def plan_batches(
         planners: Method -> its robot; the chosen one is first.
         store_every: Number of ticks per tick whose volumes are stored, 1 or more; need not be an integer; inf: none.
         sink: Receives rows and times.
+        elsewhere: Stores the volumes, and moves the robot by the methods that ``planners`` lacks; None: there are none.
     """
-    done, most = 0, 1
+    done = 0
+    follow = MethodsFollowing(surroundings, planners, sink)
     for batch in states:
         forecast = Forecast(surroundings, batch)
-        t_ns, most = forecast.t_ns, max(most, int(batch.numbers.max()))
+        ticks, chosen = len(forecast.t_ns), follow.take(forecast)
+        stored = select_stored_ticks(done, ticks, store_every)
+        if chosen is not None:
+            if elsewhere is None:
+                store_stored_ticks(forecast, stored, chosen.horizon_s[stored], sink)
+            else:
+                elsewhere.take(batch, stored, chosen.horizon_s[stored])
+        done += ticks
+        sink.progress("plan", ticks)
+        yield
+
+
+@dataclass
+class MethodsFollowing:
+    """Moves the robot by some methods, batch by batch, and writes their motions."""
+
+    surroundings: Surroundings
+    planners: Mapping[str, Follower]  #: method -> its robot
+    sink: Sink
+    _most: int = 1  #: number of people so far
+
+    def take(self, forecast: Forecast) -> Motion | None:
+        """The next batch; returns the motion of the chosen method, None if it is not among these."""
+        t_ns, sink, chosen = forecast.t_ns, self.sink, None
+        self._most = max(self._most, int(forecast.states.numbers.max()))
         with sink.watch.stage("predict", len(t_ns)):
             around = [forecast.predict(tick) for tick in range(len(t_ns))]
-        for name, planner in planners.items():
+        for name, planner in self.planners.items():
             with sink.watch.stage(f"plan {name}", len(t_ns)):
-                motion = planner.follow(t_ns, around, surroundings.names_of(most))
+                motion = planner.follow(t_ns, around, self.surroundings.names_of(self._most))
             columns = motion_columns(motion) | nearest_columns(planner.robot, planner.static, motion)
             sink.tables.table("motion" if planner.chosen else f"motion_{name}", columns)
-            if planner.chosen:
-                stored = select_stored_ticks(done, len(t_ns), store_every)
-                with sink.watch.stage("hulls", len(stored)):
-                    for tick in stored.tolist():
-                        rows, horizon_s = forecast.rows(tick), float(motion.horizon_s[tick])
-                        volumes = forecast.person.volumes(horizon_s, rows.start, rows.stop)
-                        there = np.arange(len(volumes))
-                        person = None if batch.person is None else batch.person[rows]
-                        store_volumes(volumes, there, np.full(len(there), horizon_s), sink.tables, person)
-        done += len(t_ns)
-        sink.progress("plan", len(t_ns))
-        yield
+            chosen = motion if planner.chosen else chosen
+        return chosen
+
+
+def store_stored_ticks(forecast: Forecast, stored: Ints, horizon_s: Floats, sink: Sink) -> None:
+    """Writes the volumes of some ticks of a batch, each until its own horizon [s]."""
+    person = forecast.states.person
+    with sink.watch.stage("hulls", len(forecast.t_ns)):
+        for tick, until_s in zip(stored.tolist(), horizon_s.tolist(), strict=True):
+            rows = forecast.rows(tick)
+            volumes = forecast.person.volumes(until_s, rows.start, rows.stop)
+            there = np.arange(len(volumes))
+            numbers = None if person is None else person[rows]
+            store_volumes(volumes, there, np.full(len(there), until_s), sink.tables, numbers)
 
 
 def nearest_columns(robot: RobotModel, static: StaticObstacles | None, motion: Motion) -> dict[str, Any]:

@@ -1,13 +1,10 @@
-"""Fusion of several cameras into one moving person, Alg. 3, and an offline smoother; corrections: docs/paper.md.
-
-The smoother (Rauch, Tung, Striebel) also uses the measurements after a tick, as a reference for the online estimate.
-"""
+"""Fusion of several cameras into one moving person, Alg. 3; corrections: docs/paper.md."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -27,7 +24,7 @@ from hrcreplay.human.fusion.kalman import (
 from hrcreplay.human.fusion.kernel import run
 from hrcreplay.human.fusion.model_residual import BINS
 from hrcreplay.human.fusion.reported_deviations import FIRST_SPREAD
-from hrcreplay.human.model import LEFT_ARM, RIGHT_ARM, LimitSet, nearest
+from hrcreplay.human.model import LimitSet
 from hrcreplay.records import BODY, DOF, LENGTHS, LIMBS, POINTS, Bools, Floats, HumanStates, Ints, Measurements
 from hrcreplay.settings.sections import Fusion
 
@@ -287,88 +284,3 @@ def _track(n: int, cameras: int, *, traced: bool) -> Track:
         reacquired=np.zeros(1, dtype=np.int64),
         saturated=np.zeros(1, dtype=np.int64),
     )
-
-
-#: Unit of time in the smoother, in which the four states have similar magnitudes [s].
-_UNIT_S = 0.05
-
-
-def smooth(states: HumanStates, trace: Trace, settings: Fusion) -> HumanStates:
-    """Smooths every tick with all measurements of the run, by filterpy's smoother, joint by joint.
-
-    The angles of each arm keep one form through the run (``human.model``), so a smoothed angle does not jump. Lengths
-    are constants, so the last estimate is the best for all ticks. About 0.5 ms a tick; memory 1.5 kB a tick for the
-    trace and as much again for one joint at a time.
-
-    Args:
-        states: States of one whole run.
-        trace: Trace of the same ticks, from ``fuse``.
-        settings: Settings of the run.
-
-    Returns:
-        The smoothed states; rows before the first measurement stay NaN.
-    """
-    live = np.flatnonzero(np.isfinite(states.p[:, 0]))
-    if len(live) < 2:
-        return states
-    first = live[0]
-    dt = np.diff(states.t_ns[first:], prepend=states.t_ns[first]) * 1e-9
-    mean, cov = _one_name(states, first), trace.cov[first:]
-    smoothed, std = mean.copy(), np.empty((*mean.shape[:2], 2))
-    for j in range(mean.shape[1]):
-        smoothed[:, j], std[:, j] = _smooth_joint(mean[:, j], cov[:, j], dt, trace.damping[first:, j], settings, j)
-    return replace(
-        states,
-        p=_put(states.p, first, smoothed[:, :, 0]),
-        v=_put(states.v, first, smoothed[:, :, 1]),
-        a=_put(states.a, first, smoothed[:, :, 2]),
-        j=_put(states.j, first, smoothed[:, :, 3]),
-        p_std=_put(states.p_std, first, std[:, :, 0]),
-        v_std=_put(states.v_std, first, std[:, :, 1]),
-        lengths_m=_put(states.lengths_m, first, states.lengths_m[-1]),
-        lengths_std_m=_put(states.lengths_std_m, first, states.lengths_std_m[-1]),
-    )
-
-
-def _smooth_joint(
-    mean: Floats, cov: Floats, dt: Floats, damping: Floats, settings: Fusion, j: int
-) -> tuple[Floats, Floats]:
-    """Returns the smoothed mean (n, 4) and standard deviations of p and v (n, 2) of one joint."""
-    from filterpy.kalman import KalmanFilter  # slow to import (0.5 s), and only used for smoothing
-
-    scale = _UNIT_S ** np.arange(4.0)
-    both = scale[:, None] * scale
-    steps, which = np.unique(np.stack([dt, damping]), axis=1, return_inverse=True)  # most ticks share a few
-    Fs = [_transition(*step) * (scale[:, None] / scale) for step in steps.T]
-    Qs = [np.diag(process_noise(settings, j, *step)) * both for step in steps.T]
-    of_tick = which.ravel().tolist()
-    x, P, _, _ = KalmanFilter(4, 1).rts_smoother(
-        mean * scale, cov * both, [Fs[k] for k in of_tick], [Qs[k] for k in of_tick]
-    )
-    return x / scale, np.sqrt(np.stack([P[:, k, k] for k in range(2)], axis=1)) / scale[:2]
-
-
-def _transition(dt: float, damping: float) -> Floats:
-    """F of Eq. (43) for one joint, (4, 4), its derivatives damped."""
-    F = np.eye(4) + np.eye(4, k=1) * dt + np.eye(4, k=2) * dt**2 / 2.0 + np.eye(4, k=3) * dt**3 / 6.0
-    F[1:] *= damping
-    return F
-
-
-def _one_name(states: HumanStates, first: int) -> Floats:
-    """Converts means (n, 13, 4) so that each posture has the form nearest to the previous one."""
-    mean = np.stack([states.p, states.v, states.a, states.j], axis=2)[first:]
-    for k in range(1, len(mean)):
-        p = nearest(mean[k : k + 1, :, 0], mean[k - 1 : k, :, 0])[0]
-        mirrored = np.abs(np.sin(0.5 * (p - mean[k, :, 0]))) > 0.5  # alpha_1 moved by pi, not by a turn or not at all
-        for first_of_arm in (RIGHT_ARM, LEFT_ARM):
-            if mirrored[first_of_arm]:
-                mean[k, first_of_arm + 1] *= -1.0
-        mean[k, :, 0] = p
-    return mean
-
-
-def _put(whole: Floats, first: int, tail: Floats) -> Floats:
-    changed = whole.copy()
-    changed[first:] = tail
-    return changed

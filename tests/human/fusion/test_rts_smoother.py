@@ -4,10 +4,13 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pytest
+from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 
-from hrcreplay.human.fusion.fuse import fuse, smooth, start
+from hrcreplay.human.fusion.fuse import fuse, process_noise, start
 from hrcreplay.human.fusion.inverse_kinematics import measure
+from hrcreplay.human.fusion.smoother import smooth
 from hrcreplay.human.model import skeleton
 from hrcreplay.limits import load_limits
 from hrcreplay.records import Floats
@@ -113,3 +116,32 @@ def test_without_anybody_there_is_nothing_to_smooth() -> None:
     _, states, _, trace = fuse(start(CAMERAS), t, none, Fusion(), LIMITS, traced=True)
     assert np.isnan(smooth(states, trace, Fusion()).p).all()
     assert np.isnan(fuse(start(CAMERAS), t, none, Fusion(), LIMITS)[1].p).all()
+
+
+@pytest.mark.parametrize("gap", [False, True], ids=["seen", "unseen for a time"])
+def test_it_is_filterpys_smoother(gap: bool) -> None:
+    rng = np.random.default_rng(3)
+    capture = np.arange(0, 2_000_000_000, 20_000_000)
+    points = skeleton(moving(capture * 1e-9), np.tile(LENGTHS_M, (len(capture), 1)))
+    m = measure(frames_of(points + rng.normal(0, 0.01, points.shape), capture * 0, capture), T, Fusion())
+    if gap:
+        m = m.rows((m.capture_ns < 700_000_000) | (m.capture_ns > 1_300_000_000))
+    t, settings = np.sort(rng.integers(0, 1_990_000_000, 300)), Fusion()
+    _, states, _, trace = fuse(start(CAMERAS), t, m.rows(m.arrival_ns <= t[-1]), settings, LIMITS, traced=True)
+    smoothed, first = smooth(states, trace, settings), int(np.flatnonzero(np.isfinite(states.p[:, 0]))[0])
+    assert (trace.damping < 1.0).any() == gap
+    unit = 0.05 ** np.arange(4.0)
+    dt = np.diff(t[first:], prepend=t[first]) * 1e-9
+    for j in (0, 2, 3, 7, 12):  # of joints whose angle has one name all along
+        mean = np.stack([states.p, states.v, states.a, states.j], axis=2)[first:, j] * unit
+        F, Q = [], []
+        for step, damping in zip(dt, trace.damping[first:, j], strict=True):
+            powers = sum(np.eye(4, k=k) * step**k / (1, 1, 2, 6)[k] for k in range(4))
+            F.append(np.diag([1.0, damping, damping, damping]) @ powers * (unit[:, None] / unit))
+            Q.append(np.diag(process_noise(settings, j, step, damping) * unit**2))
+        cov = trace.cov[first:, j] * (unit[:, None] * unit)
+        x, P, _, _ = KalmanFilter(4, 1).rts_smoother(mean, cov, F, Q)
+        for k, name in enumerate("pvaj"):
+            np.testing.assert_allclose(getattr(smoothed, name)[first:, j] * unit[k], x[:, k], rtol=1e-7, atol=1e-9)
+        np.testing.assert_allclose(smoothed.p_std[first:, j], np.sqrt(P[:, 0, 0]), rtol=1e-6)
+        np.testing.assert_allclose(smoothed.v_std[first:, j] * unit[1], np.sqrt(P[:, 1, 1]), rtol=1e-6)

@@ -1,0 +1,113 @@
+"""The baselines of a run and the volumes that it stores, in the second process, beside the chosen method in the first.
+
+The first process sends each batch of fused people once its chosen method has used it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor, Future
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from hrcreplay.logs.reader import open_log
+from hrcreplay.pipeline import assembly
+from hrcreplay.pipeline.run_config import RunConfig
+from hrcreplay.pipeline.stages import MethodsFollowing, Sink, store_stored_ticks
+from hrcreplay.pipeline.surroundings import Forecast
+from hrcreplay.records import Floats, HumanStates, Ints
+from hrcreplay.store.run_folder import Stopwatch, TableWriter
+
+#: Number of batches that may wait for the second process: about 2.5 kB per tick.
+_MOST_WAITING = 100
+#: Stage -> ticks and duration [ns] of each call.
+Calls = dict[str, list[tuple[int, int]]]
+
+
+class MethodsElsewhere:
+    """Sends the batches of a run to the second process."""
+
+    def __init__(
+        self, second: Executor, run_config: RunConfig, start_ns: int, names: Sequence[str], folder: Path
+    ) -> None:
+        """Makes the robots of the second process.
+
+        Args:
+            second: The process.
+            run_config: The run.
+            start_ns: First tick of the run [ns].
+            names: The methods; none is the chosen one.
+            folder: Receives the tables.
+        """
+        self._second = second
+        self._sent = deque[Future[None]]([second.submit(_start, run_config, start_ns, names, folder)])
+
+    def take(self, batch: HumanStates, stored: Ints, horizon_s: Floats) -> None:
+        """Sends a batch; waits if too many are under way, and raises what a batch before has raised."""
+        self._sent.append(self._second.submit(_take, batch, stored, horizon_s))
+        while len(self._sent) > _MOST_WAITING:
+            self._sent.popleft().result()
+
+    def finish(self) -> Calls:
+        """Waits for the last batch, and returns the times of the stages."""
+        for sent in self._sent:
+            sent.result()
+        return self._second.submit(_finish).result()
+
+
+class _TablesAlone:
+    """Tables in a folder in which another process writes the other tables of a run."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._tables = folder, dict[str, TableWriter]()
+
+    def table(self, name: str, columns: Mapping[str, Any], /) -> None:
+        """Appends rows to a table."""
+        if name not in self._tables:
+            self._tables[name] = TableWriter(self._folder / f"{name}.parquet")
+        self._tables[name].write(columns)
+
+    def close(self) -> None:
+        """Completes the tables."""
+        for table in self._tables.values():
+            table.close()
+
+
+class _Work:
+    """What the second process does for a run."""
+
+    def __init__(self, run_config: RunConfig, start_ns: int, names: Sequence[str], folder: Path) -> None:
+        log, self._tables = open_log(run_config.log, run_config.settings.logs), _TablesAlone(folder)
+        self._sink = Sink(self._tables, Stopwatch(time.perf_counter_ns), lambda _, __: None)
+        robot = assembly.robot(run_config, assembly.robot_base(run_config, log))
+        self._surroundings = assembly.surroundings(run_config, robot)
+        moved = assembly.followers(run_config, assembly.programme(run_config, log, robot), start_ns) if names else {}
+        self._methods = MethodsFollowing(self._surroundings, {name: moved[name] for name in names}, self._sink)
+
+    def take(self, batch: HumanStates, stored: Ints, horizon_s: Floats) -> None:
+        forecast = Forecast(self._surroundings, replace(batch))  # sent records are not protected
+        self._methods.take(forecast)
+        store_stored_ticks(forecast, stored, horizon_s, self._sink)
+
+    def finish(self) -> Calls:
+        self._tables.close()
+        return {name: calls for name, calls in self._sink.watch.calls.items() if name != "predict"}
+
+
+#: The work under way in this process, which is that of one run.
+_UNDER_WAY: list[_Work] = []
+
+
+def _start(run_config: RunConfig, start_ns: int, names: Sequence[str], folder: Path) -> None:
+    _UNDER_WAY[:] = [_Work(run_config, start_ns, names, folder)]
+
+
+def _take(batch: HumanStates, stored: Ints, horizon_s: Floats) -> None:
+    _UNDER_WAY[0].take(batch, stored, horizon_s)
+
+
+def _finish() -> Calls:
+    return _UNDER_WAY.pop().finish()
