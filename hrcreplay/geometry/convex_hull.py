@@ -15,11 +15,13 @@ The extent of a turning point along a direction is exact, so arcs are not widene
 from __future__ import annotations
 
 import math
+from functools import cache
 from itertools import combinations
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
+from hrcreplay.geometry.hull_reduction import Surface, solid_hull, surface
 from hrcreplay.geometry.small_matrices import apply, multiply, singular_values
 from hrcreplay.geometry.vectors import cross, dot, edge, norm, norm_n
 from hrcreplay.kernels import njit
@@ -43,6 +45,9 @@ def hull(points_m: Floats) -> tuple[Floats, Ints]:
         for each triangle, counterclockwise seen from outside. A flat set has triangles on both sides; a line has its
         two ends and no triangles, a point one vertex.
     """
+    corners, faces = solid_hull(np.ascontiguousarray(points_m), _surface())
+    if len(faces):
+        return points_m[corners], faces
     axes = _axes(points_m)
     while len(axes) > 1:
         try:
@@ -53,6 +58,12 @@ def hull(points_m: Floats) -> tuple[Floats, Ints]:
         along = apply(points_m - points_m[0], axes[0])
         return points_m[np.sort([along.argmin(), along.argmax()])], np.empty((0, 3), np.int64)
     return points_m[:1], np.empty((0, 3), np.int64)
+
+
+@cache
+def _surface() -> Surface:
+    """The memory of this process for hulls."""
+    return surface()
 
 
 def _solid(points_m: Floats) -> tuple[Floats, Ints]:

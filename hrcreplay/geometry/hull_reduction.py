@@ -1,4 +1,4 @@
-"""Reduction of a point set to those points that may be corners of its convex hull, by an incremental hull.
+"""An incremental convex hull, and the reduction of a point set to those points that may be its corners.
 
 A point is dropped only when it is on the inner side of every triangle of a closed surface by more than the rounding
 error of that test. Such a point is inside the hull of the surface's corners for any shape of the surface, even if it is
@@ -26,6 +26,8 @@ MOST_FACES = 2 * MOST_SLOTS
 _ROUNDING = 64 * np.finfo(np.float64).eps
 #: Points that protrude by less are kept but not added to the surface, as they would make slivers [m].
 _THIN_M = 1e-10
+#: Thickness of a set, relative to its largest coordinate (or 1 m), below which its hull is not proven here.
+_THIN_SHARE = 1e-6
 #: Rows of ``Surface.planes``: outward normal, not of unit length, its product with a corner, rounding error of the side
 #: test, and the protrusion at which a point is added; and per slot: the position of its point [m].
 NX, NY, NZ, OFFSET, ROUNDING, THIN, X, Y, Z = range(9)
@@ -259,6 +261,51 @@ def keep_corners(points: Floats, count: int, work: Surface) -> tuple[int, int]:
     for slot in range(slots):
         work.faces[POINT, slot] = moved[work.faces[POINT, slot]]
     return kept, faces
+
+
+@njit(cache=True)
+def solid_hull(points: Floats, work: Surface) -> tuple[Ints, Ints]:
+    """The convex hull of a set, if its surface is proven to be that: closed, and no point protrudes from a triangle.
+
+    A point that protrudes by less than ``_THIN_M`` is no corner; one between corners may be among them.
+
+    Args:
+        points: (n, 3), all finite [m].
+        work: Receives the surface.
+
+    Returns:
+        (m,) indices of the corners, increasing, and (f, 3) triangles of them, counterclockwise seen from outside. Both
+        are empty if nothing is proven, as for a thin set or one of less than 5 points.
+    """
+    nothing, n = np.empty(0, np.int64), len(points)
+    count, _ = _grow(points, n, work, np.ones(n, np.bool_)) if n > 4 else (0, 0)
+    planes, triangles, _ = work
+    count = 0 if count and _is_thin(planes) else count
+    for i in range(n):
+        if count and _look(points[i, 0], points[i, 1], points[i, 2], count, planes, triangles)[1] > 0:
+            count = 0
+    place = np.full(n, -1)
+    for f in range(count):
+        for k in (A, B, C):
+            place[triangles[POINT, triangles[k, f]]] = 0
+    corners = np.flatnonzero(place == 0) if count else nothing
+    for k in range(len(corners)):
+        place[corners[k]] = k
+    faces = np.empty((count, 3), np.int64)
+    for f in range(count):
+        for k in range(3):
+            faces[f, k] = place[triangles[POINT, triangles[k, f]]]
+    return corners, faces
+
+
+@njit(cache=True)
+def _is_thin(planes: Floats) -> bool:
+    """Returns True if the first four points of a surface are near a line or a plane, relative to their coordinates."""
+    corners = np.ascontiguousarray(planes[X : Z + 1, :4].T)
+    size, along, normal = np.abs(corners).max(), edge(corners, 0, 1), cross(edge(corners, 0, 1), edge(corners, 0, 2))
+    area = norm(normal)
+    least = _THIN_SHARE * max(size, 1.0)
+    return area < least * norm(along) or abs(dot(normal, edge(corners, 0, 3))) < least * area
 
 
 @njit(cache=True)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
 from hrcreplay.geometry.convex_hull import hull, sphere_swept_volume_m3
+from hrcreplay.geometry.vectors import Vector, dot
 from hrcreplay.kernels import njit
 from hrcreplay.records import Bools, Floats, Ints
 
@@ -86,11 +88,17 @@ def union_volume_m3(solids: Sequence[InflatedHull], points: int, first: int = 0)
 
 def _inside(solids: Sequence[InflatedHull], low: Floats, high: Floats, points: int, first: int = 0) -> Bools:
     """Marks the points in any of the solids, for points spread evenly in a box from ``low`` to ``high`` (3,) [m]."""
-    samples = (0.5 + np.arange(first, first + points)[:, None] * _STEPS) % 1.0 * (high - low) + low
+    samples = _spread(first, points) * (high - low) + low
     inside = np.zeros(points, dtype=np.bool_)
     for solid in solids:
         _mark(samples, solid.vertices_m, solid.faces, solid.radius_m, inside)
     return inside
+
+
+@lru_cache(maxsize=2)
+def _spread(first: int, points: int) -> Floats:
+    """(points, 3) of the unit cube, evenly spread."""
+    return np.asarray((0.5 + np.arange(first, first + points)[:, None] * _STEPS) % 1.0)
 
 
 @njit(cache=True)
@@ -99,7 +107,7 @@ def _distances(points: Floats, vertices: Floats, faces: Ints) -> Floats:
     behind = _behind(vertices)
     found = np.empty(len(points))
     for i in range(len(points)):
-        found[i] = _distance(points[i], vertices, faces, normals, offsets, behind, 0.0)
+        found[i] = _distance(_corner(points, i), vertices, faces, normals, offsets, behind, 0.0)
     return found
 
 
@@ -123,14 +131,19 @@ def _mark(points: Floats, vertices: Floats, faces: Ints, radius: float, inside: 
         for k in range(3):
             low[k], high[k] = min(low[k], vertex[k]), max(high[k], vertex[k])
     for i in range(len(points)):
-        point = points[i]
-        outside = inside[i]
+        outside, point = inside[i], _corner(points, i)
         for k in range(3):
             outside = outside or point[k] < low[k] - radius or point[k] > high[k] + radius
-        f = 0
+        f, facing, highest = 0, 0, -np.inf
         while not outside and f < len(faces):
-            outside = _height(point, normals[f], offsets[f]) > radius
+            height = dot((normals[f, 0], normals[f, 1], normals[f, 2]), point) - offsets[f]
+            if height > highest:
+                facing, highest = f, height
+            outside = highest > radius
             f += 1
+        if not outside and len(faces):  # mostly the nearest triangle is the one that faces the point most
+            apart2 = _triangle(point, vertices, faces, normals, facing, highest)
+            inside[i] = outside = highest < -behind or apart2 <= radius * radius
         if not outside:
             inside[i] = _distance(point, vertices, faces, normals, offsets, behind, radius) <= radius
 
@@ -151,14 +164,14 @@ def _planes(vertices: Floats, faces: Ints) -> tuple[Floats, Floats]:
     return normals, offsets
 
 
-@njit(cache=True)
-def _height(point: Floats, normal: Floats, offset: float) -> float:
-    return normal[0] * point[0] + normal[1] * point[1] + normal[2] * point[2] - offset
+@njit(cache=True, inner=True)
+def _corner(vertices: Floats, v: int) -> Vector:
+    return vertices[v, 0], vertices[v, 1], vertices[v, 2]
 
 
 @njit(cache=True)
 def _distance(
-    point: Floats,
+    point: Vector,
     vertices: Floats,
     faces: Ints,
     normals: Floats,
@@ -170,21 +183,22 @@ def _distance(
     if np.isnan(point[0] + point[1] + point[2]):
         return np.nan
     if len(faces) == 0:
-        return np.sqrt(_segment(point, vertices[0], vertices[-1]))
+        return np.sqrt(_segment(point, _corner(vertices, 0), _corner(vertices, len(vertices) - 1)))
     nearest = np.inf
     for f in range(len(faces)):
-        height = _height(point, normals[f], offsets[f])
+        height = dot((normals[f, 0], normals[f, 1], normals[f, 2]), point) - offsets[f]
         if height > -behind and height * height < nearest:
-            a, b, c = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
-            nearest = min(nearest, _triangle(point, a, b, c, normals[f], height))
+            nearest = min(nearest, _triangle(point, vertices, faces, normals, f, height))
             if np.sqrt(nearest) <= enough:
                 break
     return 0.0 if nearest == np.inf else np.sqrt(nearest)
 
 
-@njit(cache=True)
-def _triangle(p: Floats, a: Floats, b: Floats, c: Floats, normal: Floats, height: float) -> float:
-    """Squared distance of p from a triangle: from its plane where p is above it, else from its edges."""
+@njit(cache=True, inner=True)
+def _triangle(p: Vector, vertices: Floats, faces: Ints, normals: Floats, f: int, height: float) -> float:
+    """Squared distance of p from triangle f: from its plane where p is above it, else from its edges."""
+    a, b, c = _corner(vertices, faces[f, 0]), _corner(vertices, faces[f, 1]), _corner(vertices, faces[f, 2])
+    normal = normals[f, 0], normals[f, 1], normals[f, 2]
     above = normal[0] != 0.0 or normal[1] != 0.0 or normal[2] != 0.0
     above = above and _left(p, a, b, normal) and _left(p, b, c, normal) and _left(p, c, a, normal)
     if above:
@@ -192,8 +206,8 @@ def _triangle(p: Floats, a: Floats, b: Floats, c: Floats, normal: Floats, height
     return min(_segment(p, a, b), _segment(p, b, c), _segment(p, c, a))
 
 
-@njit(cache=True)
-def _left(p: Floats, a: Floats, b: Floats, normal: Floats) -> bool:
+@njit(cache=True, inner=True)
+def _left(p: Vector, a: Vector, b: Vector, normal: Vector) -> bool:
     """Returns True if p is on the inner side of the edge from a to b of a triangle with that normal."""
     ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     wx, wy, wz = p[0] - a[0], p[1] - a[1], p[2] - a[2]
@@ -201,8 +215,8 @@ def _left(p: Floats, a: Floats, b: Floats, normal: Floats) -> bool:
     return x * normal[0] + y * normal[1] + z * normal[2] >= 0.0
 
 
-@njit(cache=True)
-def _segment(p: Floats, a: Floats, b: Floats) -> float:
+@njit(cache=True, inner=True)
+def _segment(p: Vector, a: Vector, b: Vector) -> float:
     """Squared distance of p from the segment a b, which may be a point."""
     ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     wx, wy, wz = p[0] - a[0], p[1] - a[1], p[2] - a[2]

@@ -1,8 +1,10 @@
 from __future__ import annotations
 
+import numpy as np
 import pytest
+from scipy.spatial import ConvexHull
 
-from hrcreplay.geometry.hull_reduction import END, START, is_loop, surface
+from hrcreplay.geometry.hull_reduction import END, START, is_loop, solid_hull, surface
 
 
 @pytest.mark.parametrize(
@@ -22,3 +24,31 @@ def test_only_one_simple_loop_is_one(slots: str, simple: bool) -> None:
     faces[START, : len(edges)] = [int(edge[0]) for edge in edges]
     faces[END, : len(edges)] = [int(edge[1]) for edge in edges]
     assert is_loop(len(edges), faces) is simple
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_solid_hull_is_that_of_qhull(seed: int) -> None:
+    rng, work = np.random.default_rng(seed), surface()
+    for _ in range(50):
+        points = rng.normal(size=(int(rng.integers(5, 120)), 3)) * rng.uniform(0.05, 1.0, 3) + rng.normal(size=3)
+        if seed % 2:  # many in one plane and some twice
+            points = np.concatenate([np.round(points, 1), np.round(points[:3], 1)])
+        corners, faces = solid_hull(points, work)
+        theirs = ConvexHull(points)
+        assert set(theirs.vertices) <= set(corners) | {
+            i for i in theirs.vertices if (points[corners] == points[i]).all(axis=1).any()
+        }
+        assert set(faces.ravel()) == set(range(len(corners)))
+        a, b, c = (points[corners][faces[:, k]] for k in range(3))
+        volume = np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0
+        assert volume == pytest.approx(theirs.volume, rel=1e-9)
+        edges = {(i, j) for face in faces.tolist() for i, j in zip(face, face[1:] + face[:1], strict=True)}
+        assert len(edges) == 3 * len(faces)
+        assert {(j, i) for i, j in edges} == edges  # closed, each edge once in either direction
+
+
+def test_of_a_thin_set_nothing_is_proven() -> None:
+    rng = np.random.default_rng(3)
+    flat = np.column_stack([rng.normal(size=(20, 2)), np.zeros(20)])
+    for points in (flat, flat + 1e-8 * rng.normal(size=flat.shape), flat[:, [0, 2, 2]], flat[:4] + np.eye(4, 3)):
+        assert not len(solid_hull(points, surface())[1])
