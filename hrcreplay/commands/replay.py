@@ -189,7 +189,7 @@ def _report(
     with watch.stage("contact", ticks):
         write_contact(run_config, log, writer, assembly.robot_base(run_config, log), second, seen)
     with watch.stage("report", ticks):
-        write_report(run_config, writer, meta, log, progress)
+        write_report(run_config, writer, meta, log, progress, second)
 
 
 def run_stages(

@@ -5,7 +5,10 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, Future
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -50,6 +53,7 @@ def write_report(
     meta: dict[str, Any],
     log: Log | None = None,
     progress: Progress = NO_PROGRESS,
+    second: Executor | None = None,
 ) -> None:
     """Writes metrics.json, the figures, report.html, scene.mcap and its layout beside the tables just written.
 
@@ -59,10 +63,12 @@ def write_report(
         meta: Content of run.json.
         log: Log of a replay, whose ticks can be computed again; None for a live session.
         progress: Receives the progress.
+        second: A second process, which writes scene.mcap and draws some figures; None: no such process.
     """
     progress.begin("metrics")
     near = _bounds(run_config.settings.model_dump())
     meta["cameras"] = {name: T.tolist() for name, T in sorted(_camera_poses(run_config, log).items())}
+    elsewhere = None if second is None else second.submit(_write_scene, run_config, writer.partial, meta)
     everybody = run_folder.read(writer.partial, meta, shown=True)
     found = compute(everybody, **near)
     run = everybody.of_person(everybody.people[0])
@@ -77,7 +83,7 @@ def write_report(
     folder = writer.partial / "figures"
     kinds = catalogue.select_figures(run, found)
     progress.begin("figures", len(kinds))
-    _draw_figures(run_config, everybody, found, kinds, folder, drawn_one=lambda: progress.advance("figures"))
+    _draw_figures(run_config, everybody, found, kinds, folder, progress=progress, second=second)
     progress.begin("page")
     shown = [
         tables.limit_table(run_config.prediction_limits, use="prediction"),
@@ -89,8 +95,25 @@ def write_report(
         "report.html", report_page.render(run, found, folder, shown, stops=stops, scene=scene, people=everybody.people)
     )
     if scene is not None:
-        write_scene(writer.partial / "scene.mcap", scene, everybody.measurements)
+        if elsewhere is None:
+            write_scene(writer.partial / "scene.mcap", scene, everybody.measurements)
+        else:
+            elsewhere.result()
         writer.text("foxglove-layout.json", foxglove_layout())
+
+
+def _write_scene(run_config: RunConfig, folder: Path, meta: dict[str, Any]) -> None:
+    """Writes scene.mcap in the second process."""
+    everybody = _tables(folder, json.dumps(meta))
+    scene = scene_of(run_config, everybody)
+    if scene is not None:
+        write_scene(folder / "scene.mcap", scene, everybody.measurements)
+
+
+@lru_cache(maxsize=1)
+def _tables(folder: Path, meta: str) -> Run:
+    """The tables of an open run, which the second process reads once; ``meta`` is JSON."""
+    return run_folder.read(folder, json.loads(meta), shown=True)
 
 
 def _camera_poses(run_config: RunConfig, log: Log | None) -> dict[str, Floats]:
@@ -110,7 +133,8 @@ def _draw_figures(
     folder: Path,
     *,
     pdf: bool = False,
-    drawn_one: Callable[[], None] = lambda: None,
+    progress: Progress = NO_PROGRESS,
+    second: Executor | None = None,
 ) -> list[str]:
     """Draws figures of a run with all its people; those of one person for each, where they are made for that.
 
@@ -121,17 +145,56 @@ def _draw_figures(
         kinds: The figures.
         folder: Folder for the files.
         pdf: True: also as PDF.
-        drawn_one: Called after each figure.
+        progress: Receives the progress.
+        second: A second process, which draws the last people's until it meets this one; None: no such process.
 
     Returns:
         The names drawn.
     """
+    tasks = [
+        _Drawing(
+            run_config,
+            folder,
+            tuple(kind.name for kind in kinds if number == everybody.people[0] or kind.each),
+            number,
+            pdf,
+        )
+        for number in everybody.people
+    ]
+    there: dict[int, Future[tuple[str, ...]]] = {}
+    if second is not None:
+        given = everybody.folder, json.dumps(everybody.meta), metrics
+        there = {task.number: second.submit(task.draw_there, *given) for task in tasks[:0:-1]}
     drawn: list[str] = []
-    for number in everybody.people:
-        chosen = [kind for kind in kinds if number == everybody.people[0] or kind.each]
-        data = figure_data(run_config, everybody, metrics, chosen, number)
-        drawn += catalogue.draw_all(data, folder, chosen, number, pdf=pdf, drawn=drawn_one)
+    for task in tasks:
+        if task.number not in there or there[task.number].cancel():
+            drawn += task.draw(everybody, metrics, lambda: progress.advance("figures"))
+        else:
+            drawn += there[task.number].result()
     return drawn
+
+
+@dataclass(frozen=True)
+class _Drawing:
+    """The figures of one person to draw, in either process."""
+
+    run_config: RunConfig
+    folder: Path  #: for the files
+    names: tuple[str, ...]  #: of the kinds of figures
+    number: int  #: the person
+    pdf: bool  #: True: also as PDF
+
+    def draw(
+        self, everybody: Run, metrics: Mapping[str, Metric], drawn_one: Callable[[], None] = lambda: None
+    ) -> tuple[str, ...]:
+        """Draws them; returns the names drawn."""
+        kinds = [kind for kind in catalogue.FIGURES if kind.name in self.names]
+        data = figure_data(self.run_config, everybody, metrics, kinds, self.number)
+        return catalogue.draw_all(data, self.folder, kinds, self.number, pdf=self.pdf, drawn=drawn_one)
+
+    def draw_there(self, run: Path, meta: str, metrics: Mapping[str, Metric]) -> tuple[str, ...]:
+        """Draws them in the second process."""
+        return self.draw(_tables(run, meta), metrics)
 
 
 def scene_of(run_config: RunConfig, run: Run) -> ReplayScene | None:

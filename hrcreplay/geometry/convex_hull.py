@@ -45,7 +45,7 @@ def hull(points_m: Floats) -> tuple[Floats, Ints]:
         for each triangle, counterclockwise seen from outside. A flat set has triangles on both sides; a line has its
         two ends and no triangles, a point one vertex.
     """
-    corners, faces = solid_hull(np.ascontiguousarray(points_m), _surface())
+    corners, faces = solid_hull(np.array(points_m, order="C"), _surface())  # a copy: the kernel knows one layout
     if len(faces):
         return points_m[corners], faces
     axes = _axes(points_m)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from hrcreplay.records import (
@@ -133,7 +134,7 @@ def read_states(path: Path, chunk_ticks: int) -> Iterator[HumanStates]:
     """Reads state.parquet into records, bit for bit, about ``chunk_ticks`` rows at a time; no tick is divided."""
     pending: HumanStates | None = None
     with pq.ParquetFile(path) as file:
-        cameras = tuple(n.removeprefix("valid_") for n in file.schema_arrow.names if n.startswith("valid_"))
+        cameras = _cameras(file)
         for batch in file.iter_batches(batch_size=chunk_ticks):
             states = _states(
                 {name: batch.column(name).to_numpy(zero_copy_only=False) for name in batch.schema.names}, cameras
@@ -149,6 +150,26 @@ def read_states(path: Path, chunk_ticks: int) -> Iterator[HumanStates]:
             pending = states
     if pending is not None:
         yield pending
+
+
+def read_states_at(path: Path, at_ns: Ints) -> HumanStates:
+    """Reads the rows of some ticks of state.parquet; only the groups of rows that may have them are read."""
+    found: list[HumanStates] = []
+    with pq.ParquetFile(path) as file:
+        cameras = _cameras(file)
+        column = file.schema_arrow.names.index("t_ns")
+        for group in range(file.num_row_groups):
+            known = file.metadata.row_group(group).column(column).statistics
+            if found and not ((known.min <= at_ns) & (at_ns <= known.max)).any():
+                continue
+            table = file.read_row_group(group)
+            table = table.filter(pc.is_in(table["t_ns"], pa.array(at_ns)))
+            found.append(_states({name: table[name].to_numpy() for name in table.column_names}, cameras))
+    return HumanStates.join(found)
+
+
+def _cameras(file: pq.ParquetFile) -> tuple[str, ...]:
+    return tuple(n.removeprefix("valid_") for n in file.schema_arrow.names if n.startswith("valid_"))
 
 
 def _states(column: Columns, cameras: tuple[str, ...]) -> HumanStates:

@@ -23,7 +23,7 @@ from hrcreplay.reporting.figures.scene import LinkPose, Storyboard, StoryScene
 from hrcreplay.reporting.metrics.people import named_volumes
 from hrcreplay.reporting.metrics.planning import numeric_column, position_columns
 from hrcreplay.reporting.metrics.series import find_known_ticks, instants, moment_ns, nearest_tick, times
-from hrcreplay.store.columns import read_states
+from hrcreplay.store.columns import read_states_at
 from hrcreplay.store.run_folder import Run
 
 #: Programmed time between the pictures of the storyboard [s], and their number.
@@ -261,8 +261,7 @@ def _states(run_config: RunConfig, run: Run) -> HumanStates | None:
     if run.motion is not None and len(run.motion):
         wanted_ns.append(int(times(run.motion)[nearest_tick(run.motion)]))
     known_ns = np.array([t for t in wanted_ns if t is not None], dtype=np.int64)
-    batches = read_states(run.folder / "state.parquet", 4096)
-    return HumanStates.join([batch.rows(np.isin(batch.t_ns, known_ns)) for batch in batches])
+    return read_states_at(run.folder / "state.parquet", known_ns)
 
 
 def _at(people: HumanStates, wanted_ns: Ints | int) -> HumanStates:

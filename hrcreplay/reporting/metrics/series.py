@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 from scipy.spatial import cKDTree
 
+from hrcreplay.geometry.polyline import follow_nearer
 from hrcreplay.human.model import nearest
 from hrcreplay.records import JOINTS, Bools, Floats, Ints, find_neighbours
 from hrcreplay.store.run_folder import Run
@@ -211,13 +212,7 @@ def _nearest_vertices(points: Floats, path: Floats) -> Ints:
     _, first = np.unique(np.floor(path / _CELL_M).astype(np.int64), axis=0, return_index=True)
     vertices = np.sort(first)
     found: Ints = vertices[cKDTree(path[vertices]).query(points)[1]].astype(np.int64)
-    for step in (-1, 1):
-        active = np.arange(len(points))
-        while len(active):
-            other = np.clip(found[active] + step, 0, len(path) - 1)
-            gap, now = (((path[at] - points[active]) ** 2).sum(axis=1) for at in (other, found[active]))
-            active, other = active[gap < now], other[gap < now]
-            found[active] = other
+    follow_nearer(np.ascontiguousarray(points), np.ascontiguousarray(path), found)
     return found
 
 
