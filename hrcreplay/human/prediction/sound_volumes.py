@@ -64,13 +64,12 @@ from hrcreplay.human.prediction.velocity_tube import (
     departs_m,
     departure_table,
     displaced_m,
-    speed_of,
+    motion_of_limbs,
     tube,
     tubes,
-    velocities,
 )
 from hrcreplay.kernels import njit
-from hrcreplay.records import DOF, LIMBS, POINTS, Floats, HumanStates, Ints
+from hrcreplay.records import DOF, LIMBS, Floats, HumanStates, Ints
 from hrcreplay.settings.sections import Prediction
 
 #: Added to every radius: more than the sum of all rounding errors [m].
@@ -137,6 +136,8 @@ class SoundRows(NamedTuple):
     lengths: Floats  #: (n, 7) LENGTHS [m]
     lengths_off: Floats  #: (n, 7) their largest errors [m]
     radii: Floats  #: (n, limbs) radii of volumes from the joints [m]
+    velocity: Floats  #: (n, 20, 3) of the model's points [m/s]
+    speed: Floats  #: (n, 7) of the limbs of BODY [m/s]
 
 
 def sound_rows(states: HumanStates, prediction: Prediction, rules: SoundRules) -> SoundRows:
@@ -147,12 +148,15 @@ def sound_rows(states: HumanStates, prediction: Prediction, rules: SoundRules) -
         prediction: Margins added to the model.
         rules: From ``sound_rules``, for the same settings.
     """
+    velocity, speed = motion_of_limbs(states)
     rows = SoundRows(
         at=start_states(states, prediction, rules.memory_s),
         tubed=tubes(states, rules.bounded, rules.unknown_m, rules.memory_s),
         lengths=np.ascontiguousarray(states.lengths_m),
         lengths_off=np.ascontiguousarray(prediction.sigmas * states.lengths_std_m),
         radii=np.empty((len(states), len(LIMBS) + prediction.legs)),
+        velocity=velocity,
+        speed=speed,
     )
     _radii_rows(rows, np.ascontiguousarray(states.residual_m), rules)
     return rows
@@ -225,15 +229,14 @@ def sweep_sound(
     offsets = np.zeros((last - first) * limbs + 1, np.int64)
     vertices = np.empty(((last - first) * limbs * 80 + 80, 3))
     low, high, corners = np.empty(DOF), np.empty(DOF), np.empty((SIDES, 2))
-    velocity, short = np.empty((len(POINTS), 3)), np.empty(((1 + rows.tubed.camera_points.shape[1]) * MOST_POINTS, 3))
+    short = np.empty(((1 + rows.tubed.camera_points.shape[1]) * MOST_POINTS, 3))
     n = 0
     for i in range(first, last):
         if not rows.tubed.usable[i, :limbs].all():
             enclose_row(i, rows.at, within, low, high, corners)
-        velocities(rows.at.p[i], rows.at.v[i], rows.lengths[i], velocity)
         for limb in range(limbs):
             if rows.tubed.usable[i, limb]:
-                count, radii[i - first, limb] = _tube(i, limb, rows, velocity, span_s, rules, short)
+                count, radii[i - first, limb] = _tube(i, limb, rows, span_s, rules, short)
                 vertices = append(vertices, n, short, count)
             else:
                 if limb == LEGS:
@@ -248,15 +251,13 @@ def sweep_sound(
 
 
 @njit(cache=True)
-def _tube(
-    i: int, limb: int, rows: SoundRows, velocity: Floats, span_s: float, rules: SoundRules, swept: Floats
-) -> tuple[int, float]:
+def _tube(i: int, limb: int, rows: SoundRows, span_s: float, rules: SoundRules, swept: Floats) -> tuple[int, float]:
     """Writes the points of a limb's tube; returns their number and the radius, which includes the limb's [m]."""
     tubed, thick = rows.tubed, rules.body_m[limb]
     reach_s = span_s + tubed.late_s[i, limb]
-    points, shown = tubed.points[i], tubed.camera_points[i]
+    points, shown, velocity = tubed.points[i], tubed.camera_points[i], rows.velocity[i]
     count = tube(limb, points, shown, velocity, span_s, reach_s, rules.hand_m, rules.departure, swept)
-    speed = speed_of(limb, velocity)
+    speed = rows.speed[i, limb]
     if limb == LEGS and not tubed.legs_shown[i]:
         speed = 0.0  # their radius was fitted to nobody who walks
         hidden = max(rules.legs_m, knees_out(rows.at.p[i, HEIGHT]) + THIGH_M) + HIDDEN_M + ROUNDING_M

@@ -182,7 +182,7 @@ def departs_m(limb: int, reach_s: float, residual_m: float, speed: float, table:
     """
     beyond = _until(reach_s, table.horizon_s, table.beyond_m[limb])
     beyond += min(speed, FASTEST_M_PER_S) * _until(reach_s, table.horizon_s, table.swings_s[limb])
-    times = np.interp(reach_s, table.horizon_s, table.residuals[limb])
+    times = _between(reach_s, table.horizon_s, table.residuals[limb])
     return max(residual_m, beyond + times * min(residual_m, NOISE_M) + max(0.0, residual_m - NOISE_M))
 
 
@@ -193,11 +193,26 @@ def _until(reach_s: float, horizon_s: Floats, most_m: Floats) -> float:
     Linear between the measured horizons, as it grows faster than the horizon; constant before the first; after the last
     with the same slope as before it, as people's speeds are bounded.
     """
-    found, last = np.interp(reach_s, horizon_s, most_m), len(horizon_s) - 1
+    found, last = _between(reach_s, horizon_s, most_m), len(horizon_s) - 1
     if reach_s > horizon_s[last] and last > 0:
         slope = (most_m[last] - most_m[last - 1]) / (horizon_s[last] - horizon_s[last - 1])
         found += max(0.0, slope) * (reach_s - horizon_s[last])
     return found
+
+
+@njit(cache=True)
+def _between(reach_s: float, horizon_s: Floats, values: Floats) -> float:
+    """A row (h,) of the table at ``reach_s``, linear between the horizons, constant before and after; as np.interp."""
+    last = len(horizon_s) - 1
+    if np.isnan(reach_s) or reach_s >= horizon_s[last]:
+        return reach_s if np.isnan(reach_s) else values[last]
+    k = -1
+    while reach_s >= horizon_s[k + 1]:
+        k += 1
+    if k < 0:
+        return values[0]
+    slope = (values[k + 1] - values[k]) / (horizon_s[k + 1] - horizon_s[k])
+    return slope * (reach_s - horizon_s[k]) + values[k]
 
 
 @njit(cache=True)
@@ -227,18 +242,23 @@ def speed_of(limb: int, velocity: Floats) -> float:
 
 def limb_speeds(states: HumanStates) -> Floats:
     """(n, 7) present speeds of the limbs of BODY, up to ``FASTEST_M_PER_S`` [m/s]."""
-    found = np.empty((len(states), len(BODY)))
-    _speed_rows(*(np.ascontiguousarray(part) for part in (states.p, states.v, states.lengths_m)), found)
+    found: Floats = np.minimum(motion_of_limbs(states)[1], FASTEST_M_PER_S)
     return found
 
 
+def motion_of_limbs(states: HumanStates) -> tuple[Floats, Floats]:
+    """(n, 20, 3) velocities of the model's points, NaN for other points, and (n, 7) speeds of the limbs [m/s]."""
+    velocity, speed = np.empty((len(states), len(POINTS), 3)), np.empty((len(states), len(BODY)))
+    _motion_rows(*(np.ascontiguousarray(part) for part in (states.p, states.v, states.lengths_m)), velocity, speed)
+    return velocity, speed
+
+
 @njit(cache=True)
-def _speed_rows(p: Floats, v: Floats, lengths: Floats, found: Floats) -> None:
-    velocity = np.empty((len(POINTS), 3))
+def _motion_rows(p: Floats, v: Floats, lengths: Floats, velocity: Floats, speed: Floats) -> None:
     for i in range(len(p)):
-        velocities(p[i], v[i], lengths[i], velocity)
-        for limb in range(found.shape[1]):
-            found[i, limb] = min(speed_of(limb, velocity), FASTEST_M_PER_S)
+        velocities(p[i], v[i], lengths[i], velocity[i])
+        for limb in range(speed.shape[1]):
+            speed[i, limb] = speed_of(limb, velocity[i])
 
 
 @njit(cache=True)
@@ -277,10 +297,12 @@ def tube(
         rising = 2
         for c in range(len(shown)):
             rising += 2 * np.isfinite(shown[c, PELVIS, 0])
+    sink_m = _until(reach_s, table.horizon_s, table.sink_m)
+    rise_m = _until(reach_s, table.horizon_s, table.rise_m)
     for i in range(rising):
         swept[n + i] = swept[i]
-        swept[n + i, 2] -= _until(reach_s, table.horizon_s, table.sink_m)
-        swept[i, 2] += _until(reach_s, table.horizon_s, table.rise_m)
+        swept[n + i, 2] -= sink_m
+        swept[i, 2] += rise_m
     return n + rising
 
 
