@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hrcreplay.geometry.vectors import dot3
 from hrcreplay.kernels import njit
 from hrcreplay.records import Bools, Floats, Ints
 
@@ -88,9 +87,9 @@ def _distance(
             return 0.0, high, count
         if gap < _SHORT_M:  # orthogonal to the plane of its carriers to the last digit
             for i in range(count - 1):
-                e = on.basis[i]
-                part = x0 * e[0] + x1 * e[1] + x2 * e[2]
-                x0, x1, x2 = x0 - part * e[0], x1 - part * e[1], x2 - part * e[2]
+                e0, e1, e2 = on.basis[i, 0], on.basis[i, 1], on.basis[i, 2]
+                part = x0 * e0 + x1 * e1 + x2 * e2
+                x0, x1, x2 = x0 - part * e0, x1 - part * e1, x2 - part * e2
             gap = math.sqrt(x0 * x0 + x1 * x1 + x2 * x2)
             if gap <= EXACT_M:
                 return 0.0, high, count
@@ -161,7 +160,7 @@ def _plane(on: Carriers, count: int) -> int:
             return i + 1
     on.wanted[0] = 1.0
     for i in range(count - 2, -1, -1):
-        rest = -dot3(on.basis[i], on.points[0])
+        rest = -(on.basis[i, 0] * on.points[0, 0] + on.basis[i, 1] * on.points[0, 1] + on.basis[i, 2] * on.points[0, 2])
         for j in range(i + 1, count - 1):
             rest -= on.triangle[i, j] * on.wanted[j + 1]
         on.wanted[i + 1] = rest / on.triangle[i, i]
@@ -172,23 +171,22 @@ def _plane(on: Carriers, count: int) -> int:
 @njit(cache=True)
 def _edge(on: Carriers, i: int) -> bool:
     """Adds the direction from carrier 0 to i + 1 to the basis, by Gram-Schmidt; False if it lies in the plane."""
-    e = on.basis[i]
-    for c in range(3):
-        e[c] = on.points[i + 1, c] - on.points[0, c]
-    length = math.sqrt(dot3(e, e))
+    x = on.points[i + 1, 0] - on.points[0, 0]
+    y = on.points[i + 1, 1] - on.points[0, 1]
+    z = on.points[i + 1, 2] - on.points[0, 2]
+    length = math.sqrt(x * x + y * y + z * z)
     for j in range(i):
         on.triangle[j, i] = 0.0
     for _ in range(2):  # two passes suffice
         for j in range(i):
-            part = dot3(on.basis[j], e)
+            part = on.basis[j, 0] * x + on.basis[j, 1] * y + on.basis[j, 2] * z
             on.triangle[j, i] += part
-            for c in range(3):
-                e[c] -= part * on.basis[j, c]
-    on.triangle[i, i] = math.sqrt(dot3(e, e))
-    if not on.triangle[i, i] > _FLAT * length:
+            x, y, z = x - part * on.basis[j, 0], y - part * on.basis[j, 1], z - part * on.basis[j, 2]
+    size = math.sqrt(x * x + y * y + z * z)
+    on.triangle[i, i] = size
+    if not size > _FLAT * length:
         return False
-    for c in range(3):
-        e[c] /= on.triangle[i, i]
+    on.basis[i, 0], on.basis[i, 1], on.basis[i, 2] = x / size, y / size, z / size
     return True
 
 
