@@ -610,7 +610,14 @@ class MethodsFollowing:
 
 
 def store_stored_ticks(forecast: Forecast, stored: Ints, horizon_s: Floats, sink: Sink) -> None:
-    """Writes the volumes of some ticks of a batch, each until its own horizon [s]."""
+    """Writes the volumes of some ticks of a batch, each until its own horizon.
+
+    Args:
+        forecast: The batch.
+        stored: (k,) index of each tick.
+        horizon_s: (k,) horizon of each, after its tick [s].
+        sink: Receives rows and times.
+    """
     person = forecast.states.person
     with sink.watch.stage("hulls", len(forecast.t_ns)):
         for tick, until_s in zip(stored.tolist(), horizon_s.tolist(), strict=True):
