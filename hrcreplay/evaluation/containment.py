@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hrcreplay.evaluation.recorded_person import LIMB_POINTS, RecordedPerson
-from hrcreplay.geometry.distances import distances
+from hrcreplay.geometry.distances import farthest_at_most
 from hrcreplay.geometry.inflated_hull import InflatedHull, union_volume_m3
 from hrcreplay.human.prediction.sound_reach import THIGH_M
 from hrcreplay.human.prediction.swept_volumes import limb_radii
@@ -163,7 +163,8 @@ def check_containment(
             if np.isnan(vertices).any():
                 continue
             if not (exact or sizes or counted[i]):
-                beyond[i, k] = _at_most(vertices, future, i, limb) if checked[i, k] else np.nan
+                enough_m = float(volumes.radius_m[i, k]) - limb_radius[limb]
+                beyond[i, k] = _at_most(vertices, future, i, limb, enough_m) if checked[i, k] else np.nan
                 if not beyond[i, k] + limb_radius[limb] > volumes.radius_m[i, k]:
                     continue
             solid = InflatedHull.around(vertices, float(volumes.radius_m[i, k]))
@@ -187,12 +188,9 @@ def _farthest(solid: InflatedHull, future: RecordedFuture, tick: int, limb: str)
     return float(np.nanmax(solid.distances_m(_points(future, tick, limb))))
 
 
-def _at_most(vertices_m: Floats, future: RecordedFuture, tick: int, limb: str) -> float:
+def _at_most(vertices_m: Floats, future: RecordedFuture, tick: int, limb: str, enough_m: float) -> float:
     """Returns an upper bound of the same, of the hull of some points, which need not be its corners [m]."""
-    points = _points(future, tick, limb)
-    known = points[np.isfinite(points).all(axis=1)]
-    _, high, _ = distances(np.stack([known, known], axis=1), vertices_m, np.array([0, len(vertices_m)]))
-    return float(high.max())
+    return float(farthest_at_most(_points(future, tick, limb), np.ascontiguousarray(vertices_m), enough_m))
 
 
 def _points(future: RecordedFuture, tick: int, limb: str) -> Floats:
@@ -236,10 +234,12 @@ def coverage(
     asked = states.rows(rows)
     future = recorded_future(person.t_ns, person.points_m, asked, until_s[rows])
     radii_m, nothing = body_radii_m(stage), np.zeros(1, dtype=np.bool_)
-    outcomes = []
-    for i, row in enumerate(rows.tolist()):
-        volumes = stage.volumes(asked.rows(slice(i, i + 1)), float(horizon_s[row]))
+    if not len(rows):
+        return None
+    prepared, outcomes = stage.predictor.prepare(asked), []
+    for i, until in enumerate(horizon_s[rows].tolist()):
+        volumes = prepared.volumes(until, i, i + 1)
         outcomes.append(
             check_containment(volumes, future.rows(slice(i, i + 1)), radii_m, nothing, sizes=False, exact=False)
         )
-    return Outcome.join(outcomes) if outcomes else None
+    return Outcome.join(outcomes)

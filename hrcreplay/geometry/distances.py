@@ -252,6 +252,35 @@ def separating_plane(
     return low, high
 
 
+@njit(cache=True)
+def farthest_at_most(points: Floats, vertices: Floats, enough_m: float) -> float:
+    """Upper bound of the largest distance of some points from a hull [m].
+
+    Where a point is within ``enough_m`` of a vertex, the bound is its distance from that; else it is as ``distances``.
+
+    Args:
+        points: (k, 3); points that are not finite are ignored [m].
+        vertices: (m, 3) [m].
+        enough_m: Distance below which any bound will do [m].
+    """
+    most, work, ends = 0.0, carriers(), np.empty((2, 3))
+    for i in range(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        if not math.isfinite(x + y + z):
+            continue
+        apart2 = np.inf
+        for j in range(len(vertices)):
+            a, b, c = vertices[j, 0] - x, vertices[j, 1] - y, vertices[j, 2] - z
+            apart2 = min(apart2, a * a + b * b + c * c)
+        bound = math.sqrt(apart2)
+        if bound > enough_m:
+            for k in range(2):
+                ends[k, 0], ends[k, 1], ends[k, 2] = x, y, z
+            bound = min(bound, _distance(ends, vertices, 0, len(vertices), 0, work)[1])
+        most = max(most, bound)
+    return most
+
+
 def protrusion_m(axes: Floats, radius_m: float, vertices: Floats, ball_m: float) -> Floats:
     """Computes the protrusion of capsules from a hull with a ball around each point; negative: inside the ball.
 

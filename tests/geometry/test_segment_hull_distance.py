@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hrcreplay.geometry.distances import distances
+from hrcreplay.geometry.distances import distances, farthest_at_most
 from hrcreplay.records import Floats
 from tests.geometry.exact import exact_distance
 from tests.robot.distances import axis_distance
@@ -126,3 +126,21 @@ def test_a_link_nearly_parallel_to_an_edge_of_the_lower_body() -> None:
         low, high = ours(a, b, vertices)
         assert low == pytest.approx(exact_distance(a, b, vertices), rel=0, abs=1e-10)
         assert high - low <= 1e-10
+
+
+def test_the_farthest_point_has_a_bound_that_is_exact_beyond_what_is_enough() -> None:
+    rng = np.random.default_rng(11)
+    beyond = 0
+    for _ in range(300):
+        vertices, points = rng.normal(size=(int(rng.integers(1, 20)), 3)), 2.0 * rng.normal(size=(5, 3))
+        points[0, 1] = np.nan  # not seen
+        exact = max(exact_distance(p, p, vertices) for p in points[1:])
+        for enough_m in (-0.1, 0.3, 1.5):
+            bound = farthest_at_most(points, vertices, enough_m)
+            assert bound >= exact - 1e-9
+            if exact > enough_m:
+                beyond += 1
+                assert bound == pytest.approx(exact, abs=1e-9)
+            else:
+                assert bound <= enough_m + 1e-9
+    assert 300 < beyond < 900
