@@ -3,8 +3,9 @@
 A stage has its mean in batches, as a replay runs it, and its times tick by tick, both with the work around it: tables,
 contact, distances for the record. The decision of the method, from the people to the certified step, is timed alone.
 
-References: filterpy's dense Kalman filter over the same states, Qhull on the vertices that the volumes have, and daqp
-on the controller's cost with one row per link and vertex. They are timed without the work around them.
+References: filterpy's dense Kalman filter over the same states and its smoother joint by joint, Qhull on the vertices
+that the volumes have, and daqp on the controller's cost with one row per link and vertex. They are timed without the
+work around them.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from __future__ import annotations
 import resource
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Unpack
@@ -26,9 +27,11 @@ from scipy.linalg import block_diag
 from scipy.spatial import ConvexHull
 
 from hrcreplay.errors import SettingsError
+from hrcreplay.human.fusion.smoother import smooth
 from hrcreplay.logs.reader import open_log
 from hrcreplay.pipeline import assembly, stages
 from hrcreplay.pipeline.kernel_build import ensure_compiled
+from hrcreplay.pipeline.person_fuser import PersonFuser
 from hrcreplay.pipeline.progress import NO_PROGRESS, Progress
 from hrcreplay.pipeline.run_config import RunConfig, RunOptions, resolve
 from hrcreplay.pipeline.stages import Sink
@@ -43,6 +46,8 @@ from hrcreplay.store.run_folder import Stopwatch
 SECONDS, FEW = 20.0, 500
 #: Ticks of a batch.
 BATCH = 250
+#: Number of calls of a smoother.
+_SMOOTHINGS = 3
 #: Vertices of a volume this near to a plane lie in it [m].
 _FLAT_M = 1e-6
 _MB = 1024.0
@@ -220,7 +225,7 @@ def _time_references(
     rows = known[np.linspace(0, len(known) - 1, min(FEW, len(known))).astype(int)]
     ticks = np.searchsorted(forecast.t_ns, states.t_ns[rows])
     horizons = kept.column("motion", ["horizon_s"])[ticks, 0]
-    found = {"filterpy: dense filter": _dense_filter_us(kept, states.t_ns)}
+    found = {"filterpy: dense filter": _dense_filter_us(kept, states.t_ns), **_smoothers_us(run_config, forecast.t_ns)}
     volumes = [forecast.person.volumes(float(h), int(row), int(row) + 1) for row, h in zip(rows, horizons, strict=True)]
     hulls = [[cloud for i in range(len(one.limbs)) if _is_solid(cloud := one.vertices(0, i))] for one in volumes]
     found["volumes of one person alone"] = _each_us(
@@ -281,6 +286,29 @@ def _dense_filter_us(kept: _Kept, t_ns: Ints) -> Floats:
             seen += 1
         took.append((time.perf_counter_ns() - begin_ns) / 1e3)
     return np.array(took)
+
+
+def _smoothers_us(run_config: RunConfig, ticks_ns: Ints) -> dict[str, Floats]:
+    """Times the smoother and filterpy's on the first ticks at which person 1 is known: name -> (n,) for a tick [us]."""
+    log = open_log(run_config.log, run_config.settings.logs)
+    stage, few_ns = assembly.fusion_stage(run_config, log), ticks_ns[: 2 * FEW]
+    fuser = PersonFuser(replace(stage, watched=None), log.header.cameras, traced=True)
+    frames = log.frames(int(few_ns[0]), int(few_ns[-1]) + 1)
+    fused, _ = fuser.update(*next(stages.batches(frames, few_ns, len(few_ns))))
+    known = np.isfinite(fused.states.p).all(axis=1) & (fused.states.numbers == 1)
+    rows = np.flatnonzero(known)[:FEW]
+    if len(rows) < 2:
+        return {}
+    states, trace = replace(fused.states.rows(rows), person=None), fused.trace.rows(rows)
+    mean, (F, Q) = np.stack([states.p, states.v, states.a, states.j], axis=2), (np.eye(4), 1e-6 * np.eye(4))
+
+    def by_filterpy(_: int) -> None:
+        for j in range(DOF):
+            KalmanFilter(4, 1).rts_smoother(mean[:, j], trace.cov[:, j], [F] * len(rows), [Q] * len(rows))
+
+    calls = range(_SMOOTHINGS)
+    ours = _each_us(calls, lambda _: smooth(states, trace, stage.filter))
+    return {"smoother": ours / len(rows), "filterpy: smoother": _each_us(calls, by_filterpy) / len(rows)}
 
 
 def dense_problem(robot: RobotModel, q: Floats, dq: Floats, seen: Obstacles) -> tuple[Floats, ...]:

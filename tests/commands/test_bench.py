@@ -25,7 +25,7 @@ def test_every_stage_and_reference_is_timed() -> None:
     assert {"angles", "fuse", "predict", "plan qp", "plan none", "hulls"} <= set(rows)
     assert {"decision of qp", "volumes of a decision"} < set(rows)
     assert rows["volumes of a decision"].mean_us < rows["decision of qp"].mean_us, "a part of it"
-    assert {"filterpy: dense filter", "qhull: hulls of their vertices"} < set(rows)
+    assert {"filterpy: dense filter", "filterpy: smoother", "smoother", "qhull: hulls of their vertices"} < set(rows)
     assert rows["fuse"].ticks == 76  # 0.3 s at 250 Hz, both ends
     for row in found.rows:
         assert 0.0 < row.median_us <= row.p99_us <= row.max_us

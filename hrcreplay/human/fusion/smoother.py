@@ -1,7 +1,7 @@
 """The offline smoother of Rauch, Tung and Striebel: each tick by the measurements before and after it.
 
 It is a reference for the filter, and the recorded person where a log has no ground truth. A test compares it with
-filterpy's, which takes one joint at a time and is forty times slower.
+filterpy's, which takes one joint at a time; ``hrcreplay bench`` times both.
 """
 
 from __future__ import annotations
