@@ -74,7 +74,8 @@ def read_recorded_people(
             for part in _smooth(run_config, log, ticks_ns):
                 writer.table("smooth", state_columns(part))
             writer.close_tables()
-        return HumanStates.join(list(read_states(path, _BATCH)))
+        parts = read_states(path, _BATCH)
+        return HumanStates.join([replace(part, camera_points_m=None) for part in parts])  # half of the memory
 
     return read_people(log, ticks_ns, fusion_stage, smoothed, seen)
 
@@ -111,8 +112,11 @@ def write_contact(
     people = read_recorded_people(run_config, log, writer, seen)
     judged = _JudgedRun(run_config, T_world_base, people, writer.partial)
     paths = sorted(writer.partial.glob("motion*.parquet"))
-    full = judged.full if second is None else second.submit(judged.full).result
-    there = {path: second.submit(judged.tables, path) for path in paths[1:] if second is not None}
+    full, there = judged.full, {}
+    if second is not None:
+        second.submit(_take_there, judged)
+        full = second.submit(_full_there).result
+        there = {path: second.submit(_tables_there, path) for path in paths[1:]}
     for path in paths:
         motion, capsules = pq.read_table(path).to_pandas(), None
         if path.stem == "motion":
@@ -127,6 +131,8 @@ def write_contact(
         writer.table("contact", rows)
         writer.table("severity", meetings)
     writer.close_tables()
+    if second is not None:
+        second.submit(_forget_there)
 
 
 @dataclass(frozen=True)
@@ -175,6 +181,26 @@ class _JudgedRun:
         rows = contact_table(run_config, self.robot, method, motion, people, self.predicted, own, until, capsules)
         meetings = arrow_table(rows).to_pandas()
         return rows, severity_table(run_config, self.robot, method, motion, meetings, people, capsules)
+
+
+#: The run that is judged in the second process.
+_THERE: list[_JudgedRun] = []
+
+
+def _take_there(judged: _JudgedRun) -> None:
+    _THERE[:] = [judged]
+
+
+def _full_there() -> Coverage:
+    return _THERE[0].full()
+
+
+def _tables_there(path: Path) -> tuple[Columns, Columns]:
+    return _THERE[0].tables(path)
+
+
+def _forget_there() -> None:
+    _THERE.clear()
 
 
 def body_table(people: RecordedPeople, at_ns: Ints, hand_m: float) -> Columns:

@@ -275,12 +275,13 @@ def solid_hull(points: Floats, work: Surface) -> tuple[Ints, Ints]:
 
     Returns:
         (m,) indices of the corners, increasing, and (f, 3) triangles of them, counterclockwise seen from outside. Both
-        are empty if nothing is proven, as for a thin set or one of less than 5 points.
+        are empty if nothing is proven, as for a thin set, one of less than 5 points, or one with a triangle so narrow
+        that rounding decides on its normal.
     """
     nothing, n = np.empty(0, np.int64), len(points)
     count, _ = _grow(points, n, work, np.ones(n, np.bool_)) if n > 4 else (0, 0)
     planes, triangles, _ = work
-    count = 0 if count and _is_thin(planes) else count
+    count = 0 if count and (_is_thin(planes) or _has_sliver(count, planes)) else count
     for i in range(n):
         if count and _look(points[i, 0], points[i, 1], points[i, 2], count, planes, triangles)[1] > 0:
             count = 0
@@ -306,6 +307,15 @@ def _is_thin(planes: Floats) -> bool:
     area = norm(normal)
     least = _THIN_SHARE * max(size, 1.0)
     return area < least * norm(along) or abs(dot(normal, edge(corners, 0, 3))) < least * area
+
+
+@njit(cache=True)
+def _has_sliver(count: int, planes: Floats) -> bool:
+    """Returns True if the side test of a triangle may be off by more than ``_THIN_M``."""
+    for f in range(count):
+        if not planes[ROUNDING, f] <= _THIN_M * np.sqrt(planes[NX, f] ** 2 + planes[NY, f] ** 2 + planes[NZ, f] ** 2):
+            return True
+    return False
 
 
 @njit(cache=True)

@@ -25,7 +25,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from hrcreplay.errors import SettingsError
-from hrcreplay.records import RECORDED, Floats
+from hrcreplay.records import POINTS, RECORDED, Floats
 
 #: The outputs that may differ between two runs on the same log and settings.
 NOT_DETERMINISTIC = frozenset({"run.json", "timing.json"})
@@ -289,8 +289,8 @@ def read_meta(folder: Path, *, broken_off: bool = False) -> dict[str, Any]:
     return meta
 
 
-#: Columns of the table of states that no page shows: two thirds of the table.
-NOT_SHOWN = re.compile("^point_|_(acc|jerk|std)$")
+#: Columns of the table of states that no page shows, those of each camera's points among them: most of the table.
+NOT_SHOWN = re.compile(rf"(^|_)point_({'|'.join(POINTS)})_[xyz]$|_(acc|jerk|std)$")
 
 
 def read(folder: Path, meta: dict[str, Any] | None = None, *, shown: bool = False) -> Run:

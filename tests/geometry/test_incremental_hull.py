@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
+from hrcreplay.geometry.convex_hull import sphere_swept_volume_m3
 from hrcreplay.geometry.hull_reduction import END, START, is_loop, solid_hull, surface
 
 
@@ -52,3 +53,21 @@ def test_of_a_thin_set_nothing_is_proven() -> None:
     flat = np.column_stack([rng.normal(size=(20, 2)), np.zeros(20)])
     for points in (flat, flat + 1e-8 * rng.normal(size=flat.shape), flat[:, [0, 2, 2]], flat[:4] + np.eye(4, 3)):
         assert not len(solid_hull(points, surface())[1])
+
+
+@pytest.mark.parametrize("moved_m", [1e-8, 1e-7, 1e-6, 1e-5, 1e-4])
+def test_a_narrow_triangle_counts_as_much_as_it_turns(moved_m: float) -> None:
+    """A trunk that hardly moves has narrow triangles; its volume is that of one at rest, by Steiner's formula."""
+    rng = np.random.default_rng(4)
+    shoulders_and_pelvis = np.array([[0.14, 0.05, 1.7], [-0.16, -0.03, 1.72], [0.0, 0.0, 1.24]]) + np.array(
+        [2.5, 0.2, 0.0]
+    )
+    for _ in range(200):
+        ends = shoulders_and_pelvis + 0.02 * rng.normal(size=(3, 3))
+        later = ends + moved_m * np.array([-0.7, 0.3, 0.8]) + 0.3 * moved_m * rng.normal(size=(3, 3))
+        still, moved = (
+            np.concatenate([points + np.array([0.0, 0.0, 0.05]), points - np.array([0.0, 0.0, 0.52])])
+            for points in (ends, np.concatenate([ends, later]))
+        )
+        want = sphere_swept_volume_m3(still, 1.0)
+        assert sphere_swept_volume_m3(moved, 1.0) == pytest.approx(want, abs=20.0 * moved_m + 1e-7)
