@@ -53,7 +53,7 @@ from hrcreplay.robot.task import Reference
 from hrcreplay.settings.load import Settings
 from hrcreplay.settings.sections import Plan, Prediction
 from hrcreplay.store.columns import motion_columns, read_states
-from hrcreplay.store.run_folder import RunWriter, Stopwatch, arrow_table
+from hrcreplay.store.run_folder import FolderTables, RunWriter, Stopwatch, arrow_table
 
 #: The default variants: the programme without reaction; four methods with the sound volumes up to the end of each
 #: tick's own stop; qp with sound volumes up to a fixed horizon; and the two methods of the paper with its volumes and
@@ -405,7 +405,7 @@ def plan(task: VariantTask, progress: Callable[[int], None] | None = None) -> tu
     """
     began_s, run_config, slug = time.perf_counter(), task.run_config, task.variant.slug
     robot = assembly.robot(run_config, task.programme.T_world_base)
-    states, writer = task.folder / "state.parquet", _TablesOf(task.folder)
+    states, writer = task.folder / "state.parquet", FolderTables(task.folder)
     surroundings = assembly.surroundings(run_config, robot)
     done, most, planner = 0, 1, None if task.ready else _planner(task, robot)
     for batch in read_states(states, task.size):
@@ -448,15 +448,6 @@ def _planner(task: VariantTask, robot: RobotModel) -> Follower:
     static = assembly.static_scene(run_config, robot, path, programme.start_s)
     controller = assembly.make_controller(task.variant.method, robot, path, settings, programme.start_s, static)
     return Planner(controller, chosen=True)
-
-
-class _TablesOf(RunWriter):
-    """Writes tables into an existing folder."""
-
-    @property
-    def partial(self) -> Path:
-        """The folder itself."""
-        return self.folder
 
 
 def _meta(run_configs: Sequence[RunConfig], methods: list[str], began: datetime) -> dict[str, Any]:

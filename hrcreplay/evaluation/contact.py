@@ -28,6 +28,7 @@ from hrcreplay.human.model import LEG_PARTS, PARTS, part_radii
 from hrcreplay.logs.reader import Log
 from hrcreplay.pipeline import assembly, stages
 from hrcreplay.pipeline.fusion_stage import SeenBodies
+from hrcreplay.pipeline.people_smoother import PeopleSmoother
 from hrcreplay.pipeline.person_fuser import PersonFuser
 from hrcreplay.pipeline.run_config import RunConfig
 from hrcreplay.pipeline.surroundings import PredictionStage
@@ -84,7 +85,7 @@ def _smooth(run_config: RunConfig, log: Log, ticks_ns: Ints) -> Iterator[HumanSt
     """Fuses and smooths the people, if the stage was not run or was reused."""
     fusion_stage, cameras = assembly.fusion_stage(run_config, log), log.header.cameras
     fuser = PersonFuser(replace(fusion_stage, watched=None), cameras, traced=True)
-    smoother = stages.PeopleSmoother(fusion_stage.filter)
+    smoother = PeopleSmoother(fusion_stage.filter)
     for ticks, seen in stages.batches(log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1), ticks_ns, _BATCH):
         fused, _ = fuser.update(ticks, seen)
         yield from smoother.add(fused.states, fused.trace)

@@ -17,8 +17,9 @@ from hrcreplay.human.fusion import fuse, inverse_kinematics
 from hrcreplay.human.model import part_axes, skeleton
 from hrcreplay.logs.reader import Log
 from hrcreplay.pipeline.fusion_stage import FusionStage, SeenBodies, as_frames
+from hrcreplay.pipeline.people_smoother import PeopleSmoother
 from hrcreplay.pipeline.person_fuser import PersonFuser
-from hrcreplay.pipeline.stages import PeopleSmoother, batches
+from hrcreplay.pipeline.stages import batches
 from hrcreplay.records import (
     LENGTHS,
     POINTS,

@@ -13,7 +13,7 @@ def follow_nearer(points: Floats, path: Floats, at: Ints) -> None:
     Args:
         points: (n, 3) [m].
         path: (m, 3) vertices [m].
-        at: (n,) vertex from which each point starts; replaced by the last one [-].
+        at: (n,) vertex from which each point starts; replaced by the last one.
     """
     for i in range(len(points)):
         now = _apart2(points, i, path, at[i])

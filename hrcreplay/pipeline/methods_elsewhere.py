@@ -7,11 +7,10 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from hrcreplay.logs.reader import open_log
 from hrcreplay.pipeline import assembly
@@ -19,7 +18,7 @@ from hrcreplay.pipeline.run_config import RunConfig
 from hrcreplay.pipeline.stages import MethodsFollowing, Sink, store_stored_ticks
 from hrcreplay.pipeline.surroundings import Forecast
 from hrcreplay.records import Floats, HumanStates, Ints
-from hrcreplay.store.run_folder import Stopwatch, TableWriter
+from hrcreplay.store.run_folder import FolderTables, Stopwatch
 
 #: Number of batches that may wait for the second process: about 2.5 kB per tick.
 _MOST_WAITING = 100
@@ -58,29 +57,11 @@ class MethodsElsewhere:
         return self._second.submit(_finish).result()
 
 
-class _TablesAlone:
-    """Tables in a folder in which another process writes the other tables of a run."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder, self._tables = folder, dict[str, TableWriter]()
-
-    def table(self, name: str, columns: Mapping[str, Any], /) -> None:
-        """Appends rows to a table."""
-        if name not in self._tables:
-            self._tables[name] = TableWriter(self._folder / f"{name}.parquet")
-        self._tables[name].write(columns)
-
-    def close(self) -> None:
-        """Completes the tables."""
-        for table in self._tables.values():
-            table.close()
-
-
 class _Work:
     """What the second process does for a run."""
 
     def __init__(self, run_config: RunConfig, start_ns: int, names: Sequence[str], folder: Path) -> None:
-        log, self._tables = open_log(run_config.log, run_config.settings.logs), _TablesAlone(folder)
+        log, self._tables = open_log(run_config.log, run_config.settings.logs), FolderTables(folder)
         self._sink = Sink(self._tables, Stopwatch(time.perf_counter_ns), lambda _, __: None)
         robot = assembly.robot(run_config, assembly.robot_base(run_config, log))
         self._surroundings = assembly.surroundings(run_config, robot)
@@ -93,7 +74,7 @@ class _Work:
         store_stored_ticks(forecast, stored, horizon_s, self._sink)
 
     def finish(self) -> Calls:
-        self._tables.close()
+        self._tables.close_tables()
         return {name: calls for name, calls in self._sink.watch.calls.items() if name != "predict"}
 
 

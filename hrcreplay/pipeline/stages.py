@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -13,12 +13,13 @@ import numpy as np
 from hrcreplay.calibration.clock_check import ClockCheck
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.geometry.inflated_hull import InflatedHull
-from hrcreplay.human.fusion import fuse, inverse_kinematics, smoother, vacancy
+from hrcreplay.human.fusion import inverse_kinematics, vacancy
 from hrcreplay.logs.camera_checks import CameraChecks
 from hrcreplay.logs.clocks import delay_text
 from hrcreplay.logs.reader import Log
 from hrcreplay.pipeline.assembly import Follower
 from hrcreplay.pipeline.fusion_stage import FusionStage, SeenBodies
+from hrcreplay.pipeline.people_smoother import PeopleSmoother
 from hrcreplay.pipeline.person_fuser import PersonFuser
 from hrcreplay.pipeline.run_config import RunConfig
 from hrcreplay.pipeline.surroundings import Forecast, PredictionStage, Surroundings
@@ -36,7 +37,6 @@ from hrcreplay.records import (
 )
 from hrcreplay.robot.control.static_obstacles import StaticObstacles, nearest
 from hrcreplay.robot.model import RobotModel
-from hrcreplay.settings.sections import Fusion
 from hrcreplay.store.columns import (
     measurement_columns,
     motion_columns,
@@ -356,73 +356,6 @@ class PeopleChecks:
                         f"which stays within {within_m:.2f} m for {b - a:.1f} s; the robot keeps clear of it; would be "
                         "right, if it is a thing: what hides it from the camera's tracker, or logs.people = nearest"
                     )
-
-
-class PeopleSmoother:
-    """Smooths each person of a run; rows of one person are in order of time."""
-
-    def __init__(self, settings: Fusion) -> None:
-        self._settings = settings
-        self._each: dict[int, StretchSmoother] = {}
-
-    def add(self, states: HumanStates, trace: fuse.Trace) -> list[HumanStates]:
-        """Adds the next ticks; returns the stretches that they complete, smoothed."""
-        found = []
-        for number in sorted(set(states.numbers.tolist())):
-            mine = np.flatnonzero(states.numbers == number)
-            one = self._each.setdefault(number, StretchSmoother(self._settings))
-            found += _numbered(one.add(states.of_person(number), trace.rows(mine)), number)
-        return found
-
-    def finish(self) -> list[HumanStates]:
-        """Returns the remaining ticks, smoothed."""
-        return [part for number, one in sorted(self._each.items()) for part in _numbered(one.finish(), number)]
-
-
-def _numbered(parts: list[HumanStates], number: int) -> list[HumanStates]:
-    """The states of one person with its number; person 1 needs none."""
-    return parts if number == 1 else [replace(part, person=np.full(len(part), number)) for part in parts]
-
-
-class StretchSmoother:
-    """Smooths a run stretch by stretch: each tick uses all measurements of its stretch and some later ones.
-
-    A stretch uses 500 ticks of the next one; later ticks have no effect. The result does not depend on the batches of
-    the ticks. A trace takes 1.5 kB per tick, so at most two stretches are kept in memory.
-    """
-
-    TICKS, LATER = 15_000, 500
-
-    def __init__(self, settings: Fusion) -> None:
-        self._settings = settings
-        self._parts: list[tuple[HumanStates, fuse.Trace]] = []
-        self._count = 0
-
-    def add(self, states: HumanStates, trace: fuse.Trace) -> list[HumanStates]:
-        """Adds the next ticks; returns the stretches that they complete, smoothed."""
-        self._parts.append((states, trace))
-        self._count += len(states)
-        found = []
-        while self._count >= self.TICKS + self.LATER:
-            found.append(self._smooth(self.TICKS))
-        return found
-
-    def finish(self) -> list[HumanStates]:
-        """Returns the remaining ticks, smoothed."""
-        found = []
-        while self._count:
-            found.append(self._smooth(min(self._count, self.TICKS)))
-        return found
-
-    def _smooth(self, count: int) -> HumanStates:
-        """Smooths the next ``count`` ticks and removes them from memory."""
-        states = HumanStates.join([part for part, _ in self._parts])
-        trace = fuse.Trace.join([part for _, part in self._parts])
-        known = slice(0, count + self.LATER)
-        smoothed = smoother.smooth(states.rows(known), trace.rows(known), self._settings).rows(slice(0, count))
-        self._parts = [(states.rows(slice(count, None)), trace.rows(slice(count, None)))]
-        self._count -= count
-        return smoothed
 
 
 def _nobody(log: Log, found: Counter[str]) -> LogError:

@@ -124,6 +124,26 @@ def _one_nan(column: Any) -> Any:
     return column
 
 
+class FolderTables:
+    """Writes tables into an existing folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._open: dict[str, TableWriter] = {}
+
+    def table(self, name: str, columns: Mapping[str, Any], /) -> None:
+        """Appends rows to ``<name>.parquet``."""
+        if name not in self._open:
+            self._open[name] = TableWriter(self.folder / f"{name}.parquet")
+        self._open[name].write(columns)
+
+    def close_tables(self) -> None:
+        """Completes the tables, so that they can be read."""
+        for table in self._open.values():
+            table.close()
+        self._open.clear()
+
+
 @dataclass
 class RunWriter:
     """Creates a run folder. Use as a context manager: a failure removes all written files and new folders.
@@ -133,9 +153,11 @@ class RunWriter:
     """
 
     folder: Path
-    tables: dict[str, TableWriter] = field(default_factory=dict)
     timing: dict[str, Any] = field(default_factory=dict)
     _made: list[Path] = field(default_factory=list)  #: folders above that it made, the innermost first
+
+    def __post_init__(self) -> None:
+        self._tables = FolderTables(self.partial)
 
     @property
     def partial(self) -> Path:
@@ -160,15 +182,11 @@ class RunWriter:
 
     def table(self, name: str, columns: Mapping[str, Any]) -> None:
         """Appends rows to ``<name>.parquet``."""
-        if name not in self.tables:
-            self.tables[name] = TableWriter(self.partial / f"{name}.parquet")
-        self.tables[name].write(columns)
+        self._tables.table(name, columns)
 
     def close_tables(self) -> None:
         """Completes the tables, so that they can be read from ``partial``."""
-        for table in self.tables.values():
-            table.close()
-        self.tables.clear()
+        self._tables.close_tables()
 
     def copy(self, name: str, source: Path) -> None:
         """Copies a file from another run, byte for byte."""
@@ -198,8 +216,7 @@ class RunWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         try:
-            for table in self.tables.values():
-                table.close()
+            self.close_tables()
         finally:
             if self.partial.exists():
                 shutil.rmtree(self.partial)

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hrcreplay.geometry.small_matrices import cholesky, solve_lower, solve_transposed
+from hrcreplay.geometry.small_matrices import solve
 from hrcreplay.human.fusion.fuse import Trace, process_noise
 from hrcreplay.human.fusion.kalman import dot
 from hrcreplay.human.model import LEFT_ARM, RIGHT_ARM, nearest
@@ -99,9 +99,8 @@ def _run(mean: Floats, cov: Floats, Fs: Floats, Qs: Floats, of_tick: Ints) -> No
             for a in range(4):
                 predicted[a, a] += Qs[step, j, a]
                 off[a] = mean[i + 1, j, a] - dot(F[a], mean[i, j])
-            L = cholesky(predicted)
             for a in range(4):
-                K[a] = solve_transposed(L, solve_lower(L, FP[:, a]))
+                K[a] = solve(predicted, FP[:, a])
                 mean[i, j, a] += dot(K[a], off)
             predicted[:] = cov[i + 1, j] - predicted
             _product(K, predicted, FP)
