@@ -1,0 +1,33 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hrcreplay.records import DOF, HumanStates
+from hrcreplay.store.columns import read_states, read_states_at, state_columns
+from hrcreplay.store.run_folder import FolderTables, TableWriter
+from tests.human.people import states
+
+
+@pytest.mark.parametrize("people", [1, 2])
+def test_the_states_of_some_ticks_are_read_from_any_group_of_rows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, people: int
+) -> None:
+    monkeypatch.setattr(TableWriter, "ROWS", 16)
+    rng = np.random.default_rng(8)
+    every = states(rng.normal(size=(120, DOF)), rng.normal(size=(120, DOF)))
+    t_ns = 4_000_000 * (np.arange(120) // people)
+    every = replace(every, t_ns=t_ns, person=None if people == 1 else 1 + np.arange(120) % 2)
+    tables = FolderTables(tmp_path)
+    tables.table("state", state_columns(every))
+    tables.close_tables()
+    path = tmp_path / "state.parquet"
+    whole = HumanStates.join(list(read_states(path, 1000)))
+    for wanted in ([0], [t_ns[17], t_ns[16], t_ns[95]], [t_ns[-1]], [1], t_ns.tolist()):
+        found, right = read_states_at(path, np.array(wanted)), whole.rows(np.isin(whole.t_ns, wanted))
+        assert vars(found).keys() == vars(right).keys()
+        for name, value in vars(right).items():
+            np.testing.assert_array_equal(getattr(found, name), value, err_msg=name)
