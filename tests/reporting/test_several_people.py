@@ -11,6 +11,7 @@ import pytest
 from hrcreplay.human.model import PARTS
 from hrcreplay.reporting.figures import catalogue
 from hrcreplay.reporting.figures.catalogue import FigureData
+from hrcreplay.reporting.figures.prediction import skeleton_at, skeletons_at
 from hrcreplay.reporting.metrics.people import named_volumes
 from hrcreplay.reporting.page import report_page
 from hrcreplay.reporting.page.replay_page import replay_data, snapshot, solids
@@ -23,6 +24,17 @@ from tests.reporting.test_scene_mcap import _topics
 
 ONE, BOTH = moving_scene(moving_run(4.0)), moving_scene(two_people(moving_run(4.0)))
 PARTS_SHOWN = len(ONE.body_parts)
+
+
+def test_figures_draw_nobody_who_has_gone() -> None:
+    first, second = two_people(moving_run(4.0)).states()
+    t_ns = second["t_ns"].to_numpy()
+    gone = second[t_ns <= t_ns[len(t_ns) // 2]]
+    for at_ns, count in ((t_ns[len(t_ns) // 4], 2), (int(gone["t_ns"].iloc[-1]) + 150_000_000, 2), (t_ns[-1], 1)):
+        shown = skeletons_at([first, gone], int(at_ns))
+        assert len(shown) == count
+        np.testing.assert_array_equal(shown[0], skeleton_at(first, int(at_ns))[0])
+    assert skeletons_at([first, gone.iloc[:0]], int(t_ns[0]))[0].shape == (20, 3)
 
 
 def test_the_second_person_is_shown_where_it_is() -> None:

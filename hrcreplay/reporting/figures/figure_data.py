@@ -30,8 +30,6 @@ from hrcreplay.store.run_folder import Run
 _STORY_STEP_S, _STORY_COUNT = 0.8, 4
 #: Minimum deviation for a storyboard [m].
 _STORY_M = 0.01
-#: Maximum age of stored volumes at an instant [s].
-_STALE_S = 0.2
 #: Horizons at which volumes are compared.
 _HORIZONS = 7
 X, Y, THETA = (JOINTS.index(name) for name in ("x", "y", "theta"))
@@ -173,13 +171,13 @@ def story(run_config: RunConfig, run: Run, _people: HumanStates) -> Storyboard |
         begin = [int(np.argmax(s >= max(first, start - step))) for s in passed]
         at = [int(times(table)[i]) for table, i in zip((alone, motion), rows, strict=True)]
         stored, limbs = prediction.stored_at(occupancy, at[1])
-        fresh = abs(at[1] - int(times(stored)[0])) * 1e-9 <= _STALE_S
+        fresh = abs(at[1] - int(times(stored)[0])) * 1e-9 <= prediction.STALE_S
         ends = [robot.ends_m(_joints(table, i, robot.nv)) for table, i in zip((alone, motion), rows, strict=True)]
         ways = [
             position_columns(table.iloc[b : i + 1], "tcp")
             for table, b, i in zip((alone, motion), begin, rows, strict=True)
         ]
-        people_m = [prediction.skeleton_at(state, at[1])[0] for state in run.states()]
+        people_m = prediction.skeletons_at(run.states(), at[1])
         scenes.append(
             StoryScene(
                 programme_s, (at[0], at[1]), (ends[0], ends[1]), (ways[0], ways[1]), people_m, limbs if fresh else {}

@@ -24,6 +24,8 @@ from hrcreplay.reporting.metrics.planning import numeric_column
 from hrcreplay.reporting.metrics.series import columns, times
 from hrcreplay.reporting.tables import part_name_text
 
+#: Maximum age of stored volumes, and of people, at an instant [s].
+STALE_S = 0.2
 #: Limb -> its volume.
 Limbs = Mapping[str, SweptVolume]
 #: One instant of Fig. 17: t_ns, and the swept volumes of each method.
@@ -197,8 +199,7 @@ def volumes_at(occupancy: pd.DataFrame, people: Sequence[pd.DataFrame], moment_n
     """
     rows, limbs = stored_at(occupancy, moment_ns)
     t_ns = int(times(rows)[0])
-    shown = [skeleton_at(state, t_ns) for state in people]
-    heading = shown[0][1]
+    heading = skeleton_at(people[0], t_ns)[1]
     figure = drawing.column_figure(2.62)
     (ahead, above), *_ = drawing.column_panels(figure, 1, 2, bottom_in=0.68, gap_in=(0.0, 0.5))
     solids = volume_solids(limbs)
@@ -206,7 +207,7 @@ def volumes_at(occupancy: pd.DataFrame, people: Sequence[pd.DataFrame], moment_n
         low, high = bounds_of([solid.outline(view) for solid in solids], 0.03)
         drawing.set_window(ax, low.tolist(), high.tolist())
         draw_solids(ax, solids, view, opacity=0.8, line=0.45)
-        for points, _ in shown:
+        for points in skeletons_at(people, t_ns):
             _draw_bones(ax, points, view, np.zeros(2))
     horizon = f", {rows['horizon_s'].iloc[0]:.2f} s ahead" if "horizon_s" in rows else ""
     ahead.set(title=f"{rows['method'].iloc[0]}{horizon}", xlabel="across [m]", ylabel="up [m]")
@@ -272,6 +273,12 @@ def skeleton_at(state: pd.DataFrame, t_ns: int) -> tuple[Floats, float]:
     row = state.iloc[[int(np.argmin(np.abs(times(state) - t_ns)))]]
     p = columns(row)
     return skeleton(p, row[list(LENGTHS)].to_numpy(dtype=float))[0], float(p[0, JOINTS.index("theta")])
+
+
+def skeletons_at(people: Sequence[pd.DataFrame], t_ns: int) -> list[Floats]:
+    """Returns (20, 3) points of each fused person who is there at an instant [m]: nobody from before or after."""
+    there = [state for state in people if np.abs(times(state) - t_ns).min(initial=2**62) <= STALE_S * 1e9]
+    return [skeleton_at(state, t_ns)[0] for state in there]
 
 
 def _draw_person(ax: Axes, limbs: Limbs, points: Floats, view: View, centre: Floats) -> None:
