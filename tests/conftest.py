@@ -62,6 +62,15 @@ def pytest_configure() -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Compiles the kernels after a change of the sources, before the first test hears a command say so."""
+    from hrcreplay.pipeline.kernel_build import ensure_compiled
+
+    if "PYTEST_XDIST_WORKER" not in os.environ and not session.config.option.collectonly:
+        ensure_compiled()
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """Hands whole groups to the processes, in the order of the tests.

@@ -15,6 +15,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -156,8 +157,9 @@ class RunWriter:
     timing: dict[str, Any] = field(default_factory=dict)
     _made: list[Path] = field(default_factory=list)  #: folders above that it made, the innermost first
 
-    def __post_init__(self) -> None:
-        self._tables = FolderTables(self.partial)
+    @cached_property
+    def _tables(self) -> FolderTables:
+        return FolderTables(self.partial)
 
     @property
     def partial(self) -> Path:
