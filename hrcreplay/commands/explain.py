@@ -40,6 +40,7 @@ from hrcreplay.robot.control.control_step import (
 from hrcreplay.robot.control.controllers import Controller, Predict, QpController
 from hrcreplay.store.columns import motion_columns, read_states
 from hrcreplay.store.run_folder import arrow_table
+from hrcreplay.store.stored_table import RunTable
 
 #: A TCP slower than this counts as stationary [m/s].
 _STANDS = 1e-3
@@ -55,7 +56,7 @@ class Record:
     method: str
     run_config: RunConfig
     log: Log
-    motion: pd.DataFrame
+    motion: RunTable
     _q: Floats = field(init=False)
     _dq: Floats = field(init=False)
     _u: Floats = field(init=False)
@@ -400,7 +401,7 @@ def _named(found: dict[str, Any], links: Sequence[str], limbs: Sequence[str]) ->
     return named
 
 
-def longest_stops(motion: pd.DataFrame, slow_m_per_s: float, most: int = 10) -> Ints:
+def longest_stops(motion: RunTable, slow_m_per_s: float, most: int = 10) -> Ints:
     """Returns (k, 2) the longest stretches of ticks, [first, past the last), of an unplanned standstill.
 
     Args:

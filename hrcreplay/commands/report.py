@@ -69,7 +69,7 @@ def write_report(
     near = _bounds(run_config.settings.model_dump())
     meta["cameras"] = {name: T.tolist() for name, T in sorted(_camera_poses(run_config, log).items())}
     elsewhere = None if second is None else second.submit(_write_scene, run_config, writer.partial, meta)
-    everybody = run_folder.read(writer.partial, meta, shown=True)
+    everybody = run_folder.read(writer.partial, meta)
     found = compute(everybody, **near)
     run = everybody.of_person(everybody.people[0])
     stops = _stops(run_config, log, run, near["stationary_m_per_s"], found) if log else ()
@@ -113,7 +113,7 @@ def _write_scene(run_config: RunConfig, folder: Path, meta: dict[str, Any]) -> N
 @lru_cache(maxsize=1)
 def _tables(folder: Path, meta: str) -> Run:
     """The tables of an open run, which the second process reads once; ``meta`` is JSON."""
-    return run_folder.read(folder, json.loads(meta), shown=True)
+    return run_folder.read(folder, json.loads(meta))
 
 
 def _camera_poses(run_config: RunConfig, log: Log | None) -> dict[str, Floats]:
@@ -238,7 +238,8 @@ def _stops(
 def summary(folder: Path) -> list[str]:
     """Returns the main figures of a run, one line per stage."""
     run = run_folder.read(folder)
-    return lines(run.of_person(run.people[0]), compute(run, **_bounds(run.meta["settings"])))
+    known = run_folder.read_metrics(folder) or compute(run, **_bounds(run.meta["settings"]))
+    return lines(run.of_person(run.people[0]), known)
 
 
 def _bounds(settings: Mapping[str, Any]) -> dict[str, Any]:

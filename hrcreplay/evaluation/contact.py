@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pyarrow.parquet as pq
 
 from hrcreplay.evaluation.containment import Outcome, coverage
@@ -37,6 +36,7 @@ from hrcreplay.robot.model import LinkMotion, RobotModel
 from hrcreplay.robot.recorded import CapsuleSample, RecordedCapsules
 from hrcreplay.store.columns import Columns, body_columns, contact_columns, person_columns, read_states, state_columns
 from hrcreplay.store.run_folder import RunWriter, arrow_table
+from hrcreplay.store.stored_table import RunTable
 
 _BATCH = 4096
 
@@ -225,7 +225,7 @@ Coverage = Sequence[Outcome | None]
 
 
 def compute_own_coverage(
-    run_config: RunConfig, people: RecordedPeople, predicted: Predicted, motion: pd.DataFrame
+    run_config: RunConfig, people: RecordedPeople, predicted: Predicted, motion: RunTable
 ) -> Coverage:
     """Coverage of every checked tick until the horizon of the volumes that the controller used.
 
@@ -265,7 +265,7 @@ def contact_table(
     run_config: RunConfig,
     robot: RobotModel,
     method: str,
-    motion: pd.DataFrame,
+    motion: RunTable,
     people: RecordedPeople,
     predicted: Predicted,
     own: Coverage | None,
@@ -361,7 +361,7 @@ def choose_nearer(first: Nearest, second: Nearest) -> tuple[Nearest, Bools]:
 
 
 def nearest(
-    robot: RobotModel, motion: pd.DataFrame, groups: Sequence[Sequence[BodyTrack]], radii_m: Floats, hand_m: float
+    robot: RobotModel, motion: RunTable, groups: Sequence[Sequence[BodyTrack]], radii_m: Floats, hand_m: float
 ) -> tuple[Nearest, ...]:
     """Finds the nearest pair of link and body for each group of tracks, at every tick of a motion.
 
@@ -437,7 +437,7 @@ def _join(batches: Sequence[Nearest]) -> Nearest:
     return Nearest(*(np.concatenate([getattr(b, name) for b in batches]) for name in Nearest.__dataclass_fields__))
 
 
-def _is_turning(motion: pd.DataFrame) -> Bools:
+def _is_turning(motion: RunTable) -> Bools:
     """(n,) True if any axis turns; False where its velocity is not known."""
     joints = [name for name in motion.columns if name[:2] == "dq" and name[2:].isdigit()]
     dq = motion[joints].to_numpy(dtype=float)
@@ -487,7 +487,7 @@ class Predicted:
 
 
 def by_volume(
-    motion: pd.DataFrame,
+    motion: RunTable,
     found: Nearest,
     people: RecordedPeople,
     radii_m: Floats,
@@ -526,7 +526,7 @@ def by_volume(
     return outside_m
 
 
-def deciding_rows(motion: pd.DataFrame) -> Ints:
+def deciding_rows(motion: RunTable) -> Ints:
     """(n,) the row at which the motion of each tick was decided; -1 if none.
 
     That is the last row before the tick that did not just continue a stop.

@@ -1,6 +1,8 @@
-"""The nearest vertices of a polyline."""
+"""The nearest points of a polyline: its vertices, and a foot that only advances along it."""
 
 from __future__ import annotations
+
+import numpy as np
 
 from hrcreplay.kernels import njit
 from hrcreplay.records import Floats, Ints
@@ -22,6 +24,66 @@ def follow_nearer(points: Floats, path: Floats, at: Ints) -> None:
             while 0 <= other < len(path) and _apart2(points, i, path, other) < now:
                 now, at[i] = _apart2(points, i, path, other), other
                 other += step
+
+
+@njit(cache=True)
+def advance_foot(
+    points: Floats, path: Floats, way_m: Floats, until: Ints, ahead_m: float, step_m: float
+) -> tuple[int, float]:
+    """Follows a moving point with a foot on a polyline that never moves back.
+
+    Args:
+        points: (n, 3) positions of the point [m].
+        path: (m, 3) vertices [m].
+        way_m: (m,) distance along the path from its first vertex [m].
+        until: (n,) vertex that the foot must not pass at each position, increasing.
+        ahead_m: Length of the next section of the path that is searched for the foot [m].
+        step_m: Motion of the point after which its foot is searched again; it is for its last position [m].
+
+    Returns:
+        The last passed vertex, and the fraction of the distance to the next one.
+    """
+    passed, share, before = 0, 0.0, 0
+    for tick in range(len(points)):
+        waits = tick + 1 < len(points) and _apart2(points, before, points, tick) < step_m**2
+        if waits or passed == until[tick]:
+            continue
+        before = tick
+        here_m = way_m[passed] + share * (way_m[passed + 1] - way_m[passed])
+        end = min(until[tick], max(passed + 1, np.searchsorted(way_m, here_m + ahead_m)))
+        nearest, least, part = passed, np.inf, share
+        for k in range(passed, end):
+            found = _share_along(points, tick, path, k)
+            if k == passed:
+                found = max(found, share)
+            apart = _foot_apart2(points, tick, path, k, found)
+            if apart < least:
+                nearest, least, part = k, apart, found
+        passed, share = nearest, part
+        if share == 1.0:
+            passed, share = passed + 1, 0.0
+    return passed, share
+
+
+@njit(cache=True, inner=True)
+def _share_along(points: Floats, i: int, path: Floats, k: int) -> float:
+    """Place of the foot of a point on segment k: fraction of its length from vertex k, in [0, 1]."""
+    to, along2 = 0.0, 0.0
+    for axis in range(3):
+        along = path[k + 1, axis] - path[k, axis]
+        to += (points[i, axis] - path[k, axis]) * along
+        along2 += along * along
+    return min(max(to / along2, 0.0), 1.0)
+
+
+@njit(cache=True, inner=True)
+def _foot_apart2(points: Floats, i: int, path: Floats, k: int, share: float) -> float:
+    """Squared distance of a point from that place on segment k [m^2]."""
+    apart2 = 0.0
+    for axis in range(3):
+        apart = path[k, axis] + share * (path[k + 1, axis] - path[k, axis]) - points[i, axis]
+        apart2 += apart * apart
+    return apart2
 
 
 @njit(cache=True, inner=True)

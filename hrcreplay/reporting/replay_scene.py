@@ -26,6 +26,7 @@ from hrcreplay.robot.irb140_shape import Solid
 from hrcreplay.robot.model import RobotModel, Segment
 from hrcreplay.settings.sections import setting
 from hrcreplay.store.run_folder import Run
+from hrcreplay.store.stored_table import RunTable
 
 #: Rate of the replay [Hz], and the length of a run up to which it is whole; of a longer run the rate is lower [s].
 RATE_HZ, WHOLE_S = 25.0, 600.0
@@ -341,7 +342,7 @@ def replay_scene(
     )
 
 
-def _rows(table: pd.DataFrame, at_ns: Ints) -> tuple[Ints, Bools]:
+def _rows(table: RunTable, at_ns: Ints) -> tuple[Ints, Bools]:
     """Returns the last row of a table at each instant, and True if it is recent enough."""
     t_ns = times(table)
     row = np.searchsorted(t_ns, at_ns, side="right") - 1
@@ -349,7 +350,7 @@ def _rows(table: pd.DataFrame, at_ns: Ints) -> tuple[Ints, Bools]:
     return np.maximum(row, 0), known
 
 
-def _pick(table: pd.DataFrame, names: list[str], at_ns: Ints) -> Floats:
+def _pick(table: RunTable, names: list[str], at_ns: Ints) -> Floats:
     """Returns (n, len(names)) numbers of a table at some instants; NaN without a recent row."""
     if not len(table) or not set(names) <= set(table.columns):
         return np.full((len(at_ns), len(names)), np.nan)
@@ -359,14 +360,14 @@ def _pick(table: pd.DataFrame, names: list[str], at_ns: Ints) -> Floats:
     return found
 
 
-def _fused(state: pd.DataFrame | None, at_ns: Ints) -> Floats:
+def _fused(state: RunTable | None, at_ns: Ints) -> Floats:
     if state is None:
         return np.full((len(at_ns), len(SHOWN_POINTS), 3), np.nan)
     points = skeleton(_pick(state, list(JOINTS), at_ns), _pick(state, list(LENGTHS), at_ns))
     return np.asarray(points[:, [POINTS.index(name) for name in SHOWN_POINTS]])
 
 
-def _body(body: pd.DataFrame | None, parts: tuple[str, ...], at_ns: Ints) -> Floats:
+def _body(body: RunTable | None, parts: tuple[str, ...], at_ns: Ints) -> Floats:
     if body is None:
         return np.zeros((len(at_ns), 0, 2, 3))
     names = [f"{part}_{end}_{axis}" for part in parts for end in (0, 1) for axis in "xyz"]
@@ -383,7 +384,7 @@ def at_rate(t_ns: Ints, rate_hz: float) -> Ints:
     return np.flatnonzero(np.isin(t_ns, instants[first]))
 
 
-def volume_track(occupancy: pd.DataFrame | None) -> VolumeTrack:
+def volume_track(occupancy: RunTable | None) -> VolumeTrack:
     """Returns the stored volumes in order of time, at a rate of at most ``VOLUME_HZ``."""
     if occupancy is None or not len(occupancy):
         nothing, none = np.zeros(0), np.zeros(0, np.int64)
@@ -405,7 +406,7 @@ def volume_track(occupancy: pd.DataFrame | None) -> VolumeTrack:
 
 
 def _track(
-    run: Run, method: str, motion: pd.DataFrame, robot: RobotModel, t_ns: Ints, t0_ns: int, slow: float
+    run: Run, method: str, motion: RunTable, robot: RobotModel, t_ns: Ints, t0_ns: int, slow: float
 ) -> MethodTrack:
     """Returns the motion of one method.
 
@@ -446,7 +447,7 @@ _LEAVES_PATH = "qp"
 
 
 def _stops(
-    run: Run, method: str, motion: pd.DataFrame, robot: RobotModel, t_ns: Ints, q: Floats, dq: Floats, tau_s: Floats
+    run: Run, method: str, motion: RunTable, robot: RobotModel, t_ns: Ints, q: Floats, dq: Floats, tau_s: Floats
 ) -> Floats:
     """Returns (n, nv) end of the stop that would follow; NaN if the table has no value [rad].
 
@@ -472,21 +473,22 @@ def _stops(
         return np.where(np.isfinite(tau_s)[:, None], np.array(ends), np.nan)
     if method == RECORDED or "programme_s" not in motion:
         return straight
-    driven = pd.concat([motion, *(table for name, table in run.baselines.items() if name == "none")])
-    s_s, first = np.unique(numeric_column(driven, "programme_s"), return_index=True)
-    path = driven[[f"q{i}" for i in range(1, robot.nv + 1)]].to_numpy(dtype=float)[first]
+    names = ["programme_s", *(f"q{i}" for i in range(1, robot.nv + 1))]
+    tables = [motion, *(table for name, table in run.baselines.items() if name == "none")]
+    driven = np.concatenate([table[names].to_numpy(dtype=float) for table in tables])
+    s_s, first = np.unique(driven[:, 0], return_index=True)
+    path = driven[first, 1:]
     rate = np.gradient(numeric_column(motion, "programme_s"), times(motion) * 1e-9)
     row, _ = _rows(motion, t_ns)
     at_s = numeric_column(motion, "programme_s")[row] + 0.5 * rate[row] * tau_s
     return np.column_stack([np.interp(at_s, s_s, axis) for axis in path.T])
 
 
-def _names(motion: pd.DataFrame, column: str, at_ns: Ints) -> tuple[tuple[str, ...], Ints]:
+def _names(motion: RunTable, column: str, at_ns: Ints) -> tuple[tuple[str, ...], Ints]:
     """Returns the texts of a column, in order of appearance, and the index of the text at each instant; -1: none."""
     if column not in motion:
         return (), np.full(len(at_ns), -1)
-    texts = motion[column].fillna("").astype(str)
-    known = tuple(text for text in dict.fromkeys(texts) if text)
-    index = texts.map({text: i for i, text in enumerate(known)}).fillna(-1).to_numpy(dtype=np.int64)
+    index, texts = pd.factorize(motion[column].replace("", None))  # in order of appearance; -1: none
+    known = tuple(str(text) for text in texts)
     row, valid = _rows(motion, at_ns)
     return known, np.where(valid, index[row], -1)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import re
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -26,7 +25,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from hrcreplay.errors import SettingsError
-from hrcreplay.records import POINTS, RECORDED, Floats
+from hrcreplay.records import RECORDED, Floats
+from hrcreplay.store.stored_table import RunTable, StoredTable
 
 #: The outputs that may differ between two runs on the same log and settings.
 NOT_DETERMINISTIC = frozenset({"run.json", "timing.json"})
@@ -233,22 +233,22 @@ class Run:
 
     folder: Path
     meta: dict[str, Any]
-    state: pd.DataFrame | None = None
+    state: RunTable | None = None
     measurements: pd.DataFrame | None = None
     truth: pd.DataFrame | None = None
     bodies: pd.DataFrame | None = None
     agreement: pd.DataFrame | None = None
-    occupancy: pd.DataFrame | None = None
-    motion: pd.DataFrame | None = None
-    contact: pd.DataFrame | None = None
+    occupancy: RunTable | None = None
+    motion: RunTable | None = None
+    contact: RunTable | None = None
     severity: pd.DataFrame | None = None
-    body: pd.DataFrame | None = None
-    recorded: pd.DataFrame | None = None  #: motion of the robot as recorded
-    baselines: dict[str, pd.DataFrame] = field(default_factory=dict)
+    body: RunTable | None = None
+    recorded: RunTable | None = None  #: motion of the robot as recorded
+    baselines: Mapping[str, RunTable] = field(default_factory=dict)
     counts: dict[str, int] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
-    @property
+    @cached_property
     def people(self) -> tuple[int, ...]:
         """Numbers of the people with a fused state, from 1; (1,) for a run with one person."""
         if self.state is None or "person" not in self.state:
@@ -258,7 +258,7 @@ class Run:
     def of_person(self, number: int) -> Self:
         """The run as if it had tracked one person alone; the motion is that near all people."""
 
-        def rows(table: pd.DataFrame | None) -> pd.DataFrame | None:
+        def rows(table: Any) -> Any:
             if table is None or "person" not in table:
                 return table
             return table[table["person"] == number].drop(columns="person").reset_index(drop=True)
@@ -266,7 +266,7 @@ class Run:
         state, measurements, occupancy = map(rows, (self.state, self.measurements, self.occupancy))
         return replace(self, state=state, measurements=measurements, occupancy=occupancy, body=rows(self.body))
 
-    def states(self) -> list[pd.DataFrame]:
+    def states(self) -> list[RunTable]:
         """The fused states of each person; none without any."""
         each = [self.of_person(number).state for number in self.people]
         return [state for state in each if state is not None]
@@ -308,39 +308,39 @@ def read_meta(folder: Path, *, broken_off: bool = False) -> dict[str, Any]:
     return meta
 
 
-#: Columns of the table of states that no page shows, those of each camera's points among them: most of the table.
-NOT_SHOWN = re.compile(rf"(^|_)point_({'|'.join(POINTS)})_[xyz]$|_(acc|jerk|std)$")
+def read_metrics(folder: Path) -> dict[str, dict[str, Any]]:
+    """Returns the metrics of a run folder; none if its command computes none."""
+    path = folder / "metrics.json"
+    return dict(json.loads(path.read_text())) if path.exists() else {}
 
 
-def read(folder: Path, meta: dict[str, Any] | None = None, *, shown: bool = False) -> Run:
-    """Reads the tables of a run folder, or of an open run if its ``meta`` is given; ``shown``: without NOT_SHOWN."""
+def read(folder: Path, meta: dict[str, Any] | None = None) -> Run:
+    """Opens the tables of a run folder, or of an open run if its ``meta`` is given; small ones are read at once."""
     meta = read_meta(folder) if meta is None else meta
+    paths = {path.stem: path for path in sorted(folder.glob("*.parquet"))}
 
-    def table(name: str, without: re.Pattern[str] | None = None) -> pd.DataFrame | None:
-        path = folder / f"{name}.parquet"
-        if not path.exists():
-            return None
-        names = [column for column in pq.read_schema(path).names if without is None or not without.search(column)]
-        found = pq.read_table(path, columns=names, pre_buffer=False).to_pandas(split_blocks=True, self_destruct=True)
-        pa.default_memory_pool().release_unused()
-        return found
+    def stored(name: str) -> StoredTable | None:
+        return StoredTable(paths[name]) if name in paths else None
 
-    baselines = sorted({p.stem.removeprefix("motion_") for p in folder.glob("motion_*.parquet")} - {RECORDED})
+    def whole(name: str) -> pd.DataFrame | None:
+        return pq.read_table(paths[name]).to_pandas() if name in paths else None
+
+    motions = {name.removeprefix("motion_"): StoredTable(paths[name]) for name in paths if name.startswith("motion_")}
     return Run(
         folder=folder,
         meta=meta,
-        state=table("state", NOT_SHOWN if shown else None),
-        measurements=table("measurements"),
-        truth=table("truth"),
-        bodies=table("bodies"),
-        agreement=table("agreement"),
-        occupancy=table("occupancy"),
-        motion=table("motion"),
-        contact=table("contact"),
-        severity=table("severity"),
-        body=table("body"),
-        recorded=table(f"motion_{RECORDED}"),
-        baselines={name: found for name in baselines if (found := table(f"motion_{name}")) is not None},
+        state=stored("state"),
+        measurements=whole("measurements"),
+        truth=whole("truth"),
+        bodies=whole("bodies"),
+        agreement=whole("agreement"),
+        occupancy=stored("occupancy"),
+        motion=stored("motion"),
+        contact=stored("contact"),
+        severity=whole("severity"),
+        body=stored("body"),
+        recorded=motions.pop(RECORDED, None),
+        baselines=motions,
         counts=meta.get("counts", {}),
         notes=tuple(meta.get("notes", ())),
     )

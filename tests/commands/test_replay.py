@@ -32,6 +32,7 @@ from hrcreplay.store import run_folder
 from hrcreplay.store.columns import read_states
 from hrcreplay.store.run_folder import Run
 from tests.facts import facts, tells
+from tests.reporting.synthetic import frame_of
 from tests.robot import checker
 from tests.robot.distances import by_coal
 from tests.robot.swinging import asked, dense
@@ -128,7 +129,7 @@ def _assert_stored_are(run: Run) -> None:
     t_ns, horizon_s = run.motion["t_ns"].to_numpy(), run.motion["horizon_s"].to_numpy()
     directions = np.random.default_rng(0).normal(size=(50, 3))
     ticks = range(0, len(t_ns), 10)
-    by_tick = dict(iter(run.occupancy.groupby("t_ns", sort=True)))
+    by_tick = dict(iter(frame_of(run.occupancy).groupby("t_ns", sort=True)))
     for k, volumes in zip(ticks, _predicted(run, ticks, horizon_s), strict=True):
         if np.isnan(volumes.vertices(0, 0)).any():
             assert t_ns[k] not in by_tick
@@ -297,7 +298,7 @@ def test_what_the_volumes_hold_is_the_person(demo: Run) -> None:
     assert demo.state is not None
     assert demo.occupancy is not None
     arm = demo.occupancy[demo.occupancy["limb"] == "LRA"].iloc[::50]
-    state = demo.state.set_index("t_ns")
+    state = frame_of(demo.state).set_index("t_ns")
     for t, vertices, radius in zip(arm["t_ns"], arm["vertices"], arm["radius_m"], strict=True):
         row = state.loc[t]
         wrist = skeleton(row[list(JOINTS)].to_numpy(dtype=float)[None], row[list(LENGTHS)].to_numpy(dtype=float)[None])[
@@ -347,7 +348,7 @@ def test_a_tick_uses_no_frame_that_was_still_on_the_wire(tmp_path: Path) -> None
     longer = run_folder.read(replay.run("fuse", replay.demo_log(), out=tmp_path / "longer", end_s=4.0))
     assert short.state is not None
     assert longer.state is not None
-    assert short.state.equals(longer.state.iloc[: len(short.state)])
+    assert frame_of(short.state).equals(longer.state.iloc[: len(short.state)])
 
 
 def test_a_thousand_ticks_of_the_demo_are_those_of_another_solver(printed: Run, printed_volumes: SweptVolumes) -> None:

@@ -14,7 +14,7 @@ from hrcreplay.reporting.replay_scene import ReplayScene, replay_scene
 from hrcreplay.robot.model import RobotModel, irb140
 from hrcreplay.store.columns import body_columns
 from hrcreplay.store.run_folder import Run
-from tests.reporting.synthetic import LENGTHS_M, make_run, pose
+from tests.reporting.synthetic import LENGTHS_M, frame_of, make_run, pose
 
 #: Radius of each capsule of the recorded body [m].
 BODY_RADII_M = {part: 0.05 + 0.01 * i for i, part in enumerate(PARTS[:6])}
@@ -37,7 +37,7 @@ def moving_run(seconds: float = 8.0) -> Run:
     """A run with joints, stops of 0.2 s and a body at every tick, whose robot touches the body from 3.0 to 3.5 s."""
     run = make_run(seconds)
     assert run.motion is not None
-    motion = _with_joints(run.motion)
+    motion = _with_joints(frame_of(run.motion))
     t_ns = motion["t_ns"].to_numpy()
     t_s = (t_ns - t_ns[0]) * 1e-9
     axes = part_axes(skeleton(pose(t_s), np.tile(LENGTHS_M, (len(t_s), 1))), 0.1)[:, : len(BODY_RADII_M)]
@@ -45,7 +45,7 @@ def moving_run(seconds: float = 8.0) -> Run:
         run,
         meta=run.meta | {"settings": run.meta["settings"] | {"plan": {"method": "qp", "certify": True}}},
         motion=motion,
-        baselines={name: _with_joints(table) for name, table in run.baselines.items()},
+        baselines={name: _with_joints(frame_of(table)) for name, table in run.baselines.items()},
         body=pd.DataFrame(body_columns(t_ns, axes, tuple(BODY_RADII_M))),
         contact=pd.concat([_contact(t_ns, t_s, method) for method in ("qp", *run.baselines)]),
     )
@@ -97,18 +97,16 @@ SECOND_M = np.array([0.5, -0.25, 0.0])
 
 def two_people(run: Run) -> Run:
     """The run with a second person who does all that the first does, somewhere else."""
-    assert run.state is not None
-    assert run.occupancy is not None
-    assert run.body is not None
-    state = run.state.assign(**{axis: run.state[axis] + SECOND_M[k] for k, axis in enumerate("xy")})
-    moved = [np.ravel(np.reshape(flat, (-1, 3)) + SECOND_M) for flat in run.occupancy["vertices"]]
-    ends = [str(name) for name in run.body.columns[1:]]
-    body = {name: run.body[name] + SECOND_M["xyz".index(name[-1])] for name in ends}
+    of_state, of_volumes, of_body = frame_of(run.state), frame_of(run.occupancy), frame_of(run.body)
+    state = of_state.assign(**{axis: of_state[axis] + SECOND_M[k] for k, axis in enumerate("xy")})
+    moved = [np.ravel(np.reshape(flat, (-1, 3)) + SECOND_M) for flat in of_volumes["vertices"]]
+    ends = [str(name) for name in of_body.columns[1:]]
+    body = {name: of_body[name] + SECOND_M["xyz".index(name[-1])] for name in ends}
     return dataclasses.replace(
         run,
-        state=_both(run.state, state),
-        occupancy=_both(run.occupancy, run.occupancy.assign(vertices=pd.Series(moved, run.occupancy.index))),
-        body=_both(run.body, run.body.assign(**body)),
+        state=_both(of_state, state),
+        occupancy=_both(of_volumes, of_volumes.assign(vertices=pd.Series(moved, of_volumes.index))),
+        body=_both(of_body, of_body.assign(**body)),
     )
 
 

@@ -14,10 +14,17 @@ from hrcreplay.human.model import skeleton
 from hrcreplay.records import DOF, JOINTS, LENGTHS, LIMBS, Floats, Ints
 from hrcreplay.reporting.metrics.series import Metric
 from hrcreplay.store.run_folder import Run
+from hrcreplay.store.stored_table import RunTable
 
 LENGTHS_M = np.array([0.52, 0.22, 0.19, 0.30, 0.30, 0.27, 0.27])
 T0_NS = 1_700_000_000_000_000_000
 RADII_M = dict(zip(LIMBS, (0.12, 0.15, 0.07, 0.07, 0.07, 0.07), strict=True))
+
+
+def frame_of(table: RunTable | None) -> pd.DataFrame:
+    """A table of a run in memory."""
+    assert table is not None
+    return table if isinstance(table, pd.DataFrame) else table[list(table.columns)]
 
 
 def pose(t_s: Floats) -> Floats:

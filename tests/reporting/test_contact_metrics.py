@@ -16,7 +16,7 @@ from hrcreplay.reporting.summary_text import lines
 from hrcreplay.store.run_folder import Run
 from tests.facts import tells
 from tests.reporting.reading import page_lines, rendered
-from tests.reporting.synthetic import contact_run, contact_table, make_run, metrics_of
+from tests.reporting.synthetic import contact_run, contact_table, frame_of, make_run, metrics_of
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +105,9 @@ def test_the_first_sentences_of_a_robot_that_touched_nobody(run: Run, tmp_path: 
 def test_contacts_while_the_robot_retreats_have_a_count_of_their_own(run: Run) -> None:
     assert run.contact is not None
     assert run.motion is not None
-    contact = pd.concat([contact_table(run, "qp", range(95, 125)), run.contact[run.contact["method"] != "qp"]])
+    contact = pd.concat(
+        [contact_table(run, "qp", range(95, 125)), frame_of(run.contact[run.contact["method"] != "qp"])]
+    )
     tick = np.arange(len(run.motion))
     status = np.where((tick >= 100) & (tick < 110), "retreating", np.where(tick < 114, "braking", "tracking"))
     touching = dataclasses.replace(run, contact=contact, motion=run.motion.assign(status=status))
@@ -143,7 +145,9 @@ def test_how_often_the_prediction_held_the_person_stands_beside_the_verdict(run:
 
 def test_the_first_sentence_says_whose_fault_a_contact_is(run: Run) -> None:
     assert run.contact is not None
-    contact = pd.concat([contact_table(run, "qp", range(95, 125)), run.contact[run.contact["method"] != "qp"]])
+    contact = pd.concat(
+        [contact_table(run, "qp", range(95, 125)), frame_of(run.contact[run.contact["method"] != "qp"])]
+    )
     touching = dataclasses.replace(run, contact=contact)
     found = verdict.verdict(touching, metrics_of(touching))
     assert found is not None
@@ -161,7 +165,7 @@ def test_another_body_counts_and_is_told_apart_from_the_person(run: Run) -> None
     own["other_m"] = np.where(other, -0.02, 1.0)
     own["distance_m"] = np.minimum(own["person_m"], own["other_m"])
     own["source"] = np.where(own["other_m"] < own["person_m"], "xtion, body 7", "ground truth")
-    touching = dataclasses.replace(run, contact=pd.concat([own, run.contact[run.contact["method"] != "qp"]]))
+    touching = dataclasses.replace(run, contact=pd.concat([own, frame_of(run.contact[run.contact["method"] != "qp"])]))
     touching = dataclasses.replace(touching, counts={"person_frames_beside_others": 902})
     found = metrics_of(touching)
     values = {name: found[name]["value"] for name in found}
@@ -217,7 +221,7 @@ def test_what_is_never_considered_is_always_said(run: Run) -> None:
 
 def test_what_is_considered_beside_objects_is_said(run: Run) -> None:
     assert run.motion is not None
-    near = run.motion.assign(object_distance_m=0.25, self_distance_m=np.nan)
+    near = frame_of(run.motion).assign(object_distance_m=0.25, self_distance_m=np.nan)
     near.loc[near.index[3], "object_distance_m"] = 0.0314
     found = verdict.verdict(dataclasses.replace(run, motion=near), metrics_of(run))
     assert found is not None
@@ -258,7 +262,7 @@ def test_a_person_who_is_not_known_is_not_said_to_be_safe(run: Run) -> None:
 
 def test_ticks_at_which_nobody_is_known_limit_the_sentence(run: Run) -> None:
     assert run.contact is not None
-    hidden = run.contact.copy()
+    hidden = frame_of(run.contact).copy()
     hidden.loc[hidden["t_ns"] >= hidden["t_ns"].iloc[600], ["distance_m", "person_m"]] = np.nan
     found = verdict.verdict(run, metrics_of(dataclasses.replace(run, contact=hidden)))
     assert found is not None

@@ -19,7 +19,7 @@ from hrcreplay.reporting.tables import LIMB_NAMES
 from hrcreplay.store.run_folder import Run
 from tests.facts import tells
 from tests.reporting.moving import moving_run
-from tests.reporting.synthetic import RADII_M, T0_NS, make_run, metrics_of, volumes_at
+from tests.reporting.synthetic import RADII_M, T0_NS, frame_of, make_run, metrics_of, volumes_at
 
 #: Of the made-up run, whose robot has no joints: all but those that show its links.
 ALL = {kind.name for kind in FIGURES} - {"horizon", "fig15_storyboard", "robot_links"}
@@ -162,6 +162,7 @@ def test_speed_and_horizon_show_the_runs_columns() -> None:
     run = moving_run(4.0)
     motion = run.motion
     assert motion is not None
+    motion = frame_of(motion)
     motion["tau_s"] = np.linspace(0.0, 0.3, len(motion))
     seconds = (motion["t_ns"].to_numpy() - motion["t_ns"].iloc[0]) / 1e9
     nominal, actual, separation = planning.speed(motion, T0_NS, 0.5).axes
@@ -204,7 +205,7 @@ def test_instants_are_a_second_apart_and_hold_the_nearest() -> None:
     assert run.motion is not None
     ticks = instants(run)
     assert np.diff(ticks) * 1e-9 == pytest.approx([1.0, 1.0, 1.0], abs=0.011)
-    nearest = run.motion.sort_values("distance_m")["t_ns"].iloc[0]
+    nearest = frame_of(run.motion).sort_values("distance_m")["t_ns"].iloc[0]
     assert ticks[0] <= nearest <= ticks[-1]
 
 

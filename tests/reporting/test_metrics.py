@@ -13,7 +13,7 @@ from hrcreplay.records import JOINTS
 from hrcreplay.reporting.metrics.planning import add_plan, cycles, waited_s
 from hrcreplay.reporting.metrics.series import MetricTable, path_feet
 from hrcreplay.store.run_folder import Run
-from tests.reporting.synthetic import T0_NS, make_run, metrics_of
+from tests.reporting.synthetic import T0_NS, frame_of, make_run, metrics_of
 
 ANGLES = JOINTS[2:12]
 
@@ -71,7 +71,7 @@ def test_fused_rmse(run: Run, found: dict[str, dict[str, Any]]) -> None:
 def test_fused_rmse_while_the_person_is_seen(run: Run) -> None:
     """An error that grows only after the cameras are gone for longer than 0.2 s does not count."""
     assert run.state is not None
-    state = run.state.copy()
+    state = frame_of(run.state).copy()
     t_s = (state["t_ns"].to_numpy() - T0_NS) * 1e-9
     gone = (t_s > 0.6 * 12 + 0.25) & (t_s < 0.65 * 12)
     state.loc[gone, list(ANGLES)] += 1.0
@@ -123,7 +123,7 @@ def test_headings_on_either_side_of_half_a_turn_are_near() -> None:
     run = make_run(4.0)
     assert run.truth is not None
     assert run.state is not None
-    truth, state = run.truth.copy(), run.state.copy()
+    truth, state = run.truth.copy(), frame_of(run.state).copy()
     truth["theta"], state["theta"] = np.pi - 0.01, -np.pi + 0.01
     found = metrics_of(dataclasses.replace(run, truth=truth, state=state))
     assert found["fusion_rmse_theta"]["value"] == pytest.approx(0.02)
@@ -132,7 +132,7 @@ def test_headings_on_either_side_of_half_a_turn_are_near() -> None:
 def test_stationary_share(run: Run, found: dict[str, dict[str, Any]]) -> None:
     for prefix, motion in (("plan", run.motion), ("baseline_scaling", run.baselines["scaling"])):
         assert motion is not None
-        near = [row for row in motion.to_dict("records") if row["distance_m"] <= 0.5]
+        near = [row for row in frame_of(motion).to_dict("records") if row["distance_m"] <= 0.5]
         programme_s = dict(zip(motion["t_ns"], motion["programme_s"].diff().shift(-1), strict=True))
         stands = [
             row
@@ -149,7 +149,9 @@ def test_the_lower_body_has_its_own_volume_and_no_part_in_the_six(run: Run, foun
     occupancy = run.occupancy
     assert occupancy is not None
     legs = occupancy[occupancy["limb"] == "HD"].assign(limb="LEGS", volume_m3=0.7)
-    sound = metrics_of(dataclasses.replace(run, occupancy=pd.concat([occupancy, legs]).assign(method="sound")))
+    sound = metrics_of(
+        dataclasses.replace(run, occupancy=pd.concat([frame_of(occupancy), frame_of(legs)]).assign(method="sound"))
+    )
     assert sound["occupancy_sound_LEGS_m3"]["value"] == pytest.approx(0.7)
     assert sound["occupancy_sound_sum_m3"]["value"] == pytest.approx(found["occupancy_paper_sum_m3"]["value"])
     assert "occupancy_paper_LEGS_m3" not in found
@@ -242,7 +244,7 @@ def test_status_and_separation(run: Run, found: dict[str, dict[str, Any]]) -> No
     reasons = [found[n]["value"] for n in found if n.startswith("plan_braking_share_")]
     assert sum(reasons) == pytest.approx(found["plan_braking_share"]["value"])
     assert found["plan_braking_share_no_person_yet"]["value"] == pytest.approx(50 / len(motion))
-    nearest = motion.sort_values("distance_m").iloc[0]
+    nearest = frame_of(motion).sort_values("distance_m").iloc[0]
     assert found["plan_separation_min_m"]["value"] == nearest["distance_m"]
     assert found["plan_separation_min_at_s"]["value"] == pytest.approx((nearest["t_ns"] - T0_NS) * 1e-9)
     assert found["plan_separation_min_limb"]["value"] == "LRA"

@@ -21,7 +21,7 @@ from hrcreplay.reporting.verdict import verdict
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import Run
 from tests.facts import tells
-from tests.reporting.synthetic import contact_run, contact_table, metrics_of
+from tests.reporting.synthetic import contact_run, contact_table, frame_of, metrics_of
 from tests.undrawn import undrawn
 
 
@@ -85,7 +85,7 @@ def test_the_same_run_gives_the_same_bytes_with_the_time_of_the_run(run: Run) ->
 def test_however_much_there_is_to_say_it_fits_and_no_limit_is_left_out(run: Run) -> None:
     long = tuple(f"remark {k}: " + "something that the recording lacks, at length; " * 6 for k in range(40))
     methods = {f"method{k}": run.baselines["none"] for k in range(7)}
-    contact = pd.concat([run.contact, *(contact_table(run, name, range(90, 150)) for name in methods)])
+    contact = pd.concat([frame_of(run.contact), *(contact_table(run, name, range(90, 150)) for name in methods)])
     much = replace(run, notes=long, baselines=methods, contact=contact)
     metrics = metrics_of(much)
     found = pages(safety_file(much, metrics, STILLS))

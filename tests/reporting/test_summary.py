@@ -13,7 +13,7 @@ from hrcreplay.reporting import summary_text
 from hrcreplay.reporting.summary_text import lines
 from hrcreplay.store.run_folder import Run
 from tests.facts import tells
-from tests.reporting.synthetic import make_run, metrics_of
+from tests.reporting.synthetic import frame_of, make_run, metrics_of
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,7 @@ def test_predict(run: Run) -> None:
     assert tells(_lines(run)["predict"], "paper", "people", f"six limbs {total:.3f} m³")
     assert not tells(_lines(run)["predict"], "1.250 m³")
     legs = run.occupancy[run.occupancy["limb"] == "HD"].assign(limb="LEGS", volume_m3=1.25)
-    walking = dataclasses.replace(run, occupancy=pd.concat([run.occupancy, legs]))
+    walking = dataclasses.replace(run, occupancy=pd.concat([frame_of(run.occupancy), frame_of(legs)]))
     assert tells(_lines(walking)["predict"], f"six limbs {total:.3f} m³", "lower body 1.250 m³")
 
 

@@ -33,6 +33,7 @@ from hrcreplay.pipeline.surroundings import PredictionStage
 from hrcreplay.records import POINTS, Floats, HumanStates, Ints, SweptVolumes
 from hrcreplay.store import run_folder
 from hrcreplay.store.columns import read_states
+from tests.reporting.synthetic import frame_of
 from tests.test_recordings import TASK
 from tests.tools import bases
 from tests.tools.readme.measurements import ORACLED
@@ -166,7 +167,7 @@ def measure(name: str, seconds: float, tmp: Path) -> dict[str, float]:
 def _motion(folder: Path) -> pd.DataFrame:
     motion = run_folder.read(folder).motion
     assert motion is not None
-    return motion
+    return frame_of(motion)
 
 
 def told(name: str, found: dict[str, float]) -> str:

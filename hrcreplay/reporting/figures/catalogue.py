@@ -9,7 +9,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import TypeVar
 
-import pandas as pd
 from matplotlib.figure import Figure
 
 from hrcreplay.reporting.figures import drawing, fusion, planning, prediction, scene
@@ -21,6 +20,7 @@ from hrcreplay.reporting.metrics.people import named_volumes
 from hrcreplay.reporting.metrics.series import Metric, find_known_ticks, instants, moment_ns, start_ns
 from hrcreplay.settings.sections import Logs, setting
 from hrcreplay.store.run_folder import Run
+from hrcreplay.store.stored_table import RunTable
 
 _T = TypeVar("_T")
 
@@ -48,17 +48,17 @@ class FigureData:
         return start_ns(self.run)
 
     @property
-    def motion(self) -> pd.DataFrame:
+    def motion(self) -> RunTable:
         """Rows of motion.parquet."""
-        return require(self.run.motion)
+        return _require_table(self.run.motion)
 
     @property
-    def state(self) -> pd.DataFrame:
+    def state(self) -> RunTable:
         """Rows of state.parquet."""
-        return require(self.run.state)
+        return _require_table(self.run.state)
 
     @cached_property
-    def volumes(self) -> pd.DataFrame | None:
+    def volumes(self) -> RunTable | None:
         """Rows of occupancy.parquet of all people, each limb named with its person."""
         return named_volumes((self.everybody or self.run).occupancy)
 
@@ -73,6 +73,12 @@ def require(value: _T | None) -> _T:
     if value is None:
         raise ValueError("a figure is drawn without its data")
     return value
+
+
+def _require_table(table: RunTable | None) -> RunTable:
+    """The same of a table, whose type is a union."""
+    found: RunTable = require(table)  # type: ignore[assignment]
+    return found
 
 
 @dataclass(frozen=True)
@@ -169,7 +175,10 @@ FIGURES = (
         "prediction",
         ("occupancy", "person"),
         lambda data: prediction.volumes_at(
-            require(data.volumes), (data.everybody or data.run).states(), require(moment_ns(data.run)), data.t0_ns
+            _require_table(data.volumes),
+            (data.everybody or data.run).states(),
+            require(moment_ns(data.run)),
+            data.t0_ns,
         ),
         "As the paper's Fig. 9. The swept volumes that this run used, limb radii included, with the fused skeleton.",
     ),

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from hrcreplay.geometry.inflated_hull import InflatedHull
 from hrcreplay.human.model import skeleton
@@ -25,6 +24,7 @@ from hrcreplay.reporting.metrics.planning import numeric_column, position_column
 from hrcreplay.reporting.metrics.series import find_known_ticks, instants, moment_ns, nearest_tick, times
 from hrcreplay.store.columns import read_states_at
 from hrcreplay.store.run_folder import Run
+from hrcreplay.store.stored_table import RunTable
 
 #: Programmed time between the pictures of the storyboard [s], and their number.
 _STORY_STEP_S, _STORY_COUNT = 0.8, 4
@@ -234,7 +234,7 @@ _OF_ONE: dict[str, _Field] = {
 _OF_ALL: dict[str, _Field] = {"story": story, "pose": nearest_pose}
 
 
-def _joints(motion: pd.DataFrame, row: int, axes: int) -> Floats:
+def _joints(motion: RunTable, row: int, axes: int) -> Floats:
     return motion.iloc[row][[f"q{axis}" for axis in range(1, axes + 1)]].to_numpy(dtype=float)
 
 

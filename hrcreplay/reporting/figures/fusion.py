@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -26,6 +25,7 @@ from hrcreplay.reporting.metrics.series import (
     wrap,
 )
 from hrcreplay.store.run_folder import Run
+from hrcreplay.store.stored_table import RunTable
 
 LABELS = {
     "x": "x",
@@ -89,7 +89,7 @@ def coordinate(run: Run, t0_ns: int, gap_s: float, joint: str = "x") -> Figure:
     return figure
 
 
-def _frames(run: Run) -> dict[str, pd.DataFrame]:
+def _frames(run: Run) -> dict[str, RunTable]:
     """Returns the frames of each camera, in order of capture."""
     table = run.measurements
     if table is None:
@@ -99,7 +99,7 @@ def _frames(run: Run) -> dict[str, pd.DataFrame]:
     return {camera: ordered[of == camera] for camera in cameras(run)}
 
 
-def _seen(run: Run, frames: pd.DataFrame, joint: str, t0_ns: int, gap_s: float) -> tuple[Floats, Floats]:
+def _seen(run: Run, frames: RunTable, joint: str, t0_ns: int, gap_s: float) -> tuple[Floats, Floats]:
     """Draws a camera's raw values over time [s], interrupted after ``gap_s`` without frames."""
     t_ns = times(frames, "capture_ns")
     values = _beside_fused(run, joint, t_ns, frames[joint].to_numpy(dtype=float))

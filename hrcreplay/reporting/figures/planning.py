@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -20,6 +19,7 @@ from hrcreplay.reporting.figures.scene import ABOVE, View, bounds_of, draw_outli
 from hrcreplay.reporting.metrics.planning import numeric_column, position_columns, stationary
 from hrcreplay.reporting.metrics.series import Metric, envelope, path_feet, seconds_from, thin_path, times, true_runs
 from hrcreplay.reporting.tables import share_text
+from hrcreplay.store.stored_table import RunTable
 
 SIDE = view_from(-0.5 * np.pi, 0.0)
 #: Time before and after the largest deviation in which the path is drawn in bold [s].
@@ -42,7 +42,7 @@ class Deviation:
         return float(np.linalg.norm(self.at_m - self.foot_m))
 
 
-def largest_deviation(motion: pd.DataFrame) -> Deviation:
+def largest_deviation(motion: RunTable) -> Deviation:
     """Finds the largest distance between the TCP and the programmed path."""
     reference, tcp = position_columns(motion, "ref"), position_columns(motion, "tcp")
     feet = path_feet(tcp, reference)
@@ -52,8 +52,8 @@ def largest_deviation(motion: pd.DataFrame) -> Deviation:
 
 
 def path(
-    motion: pd.DataFrame,
-    occupancy: pd.DataFrame | None,
+    motion: RunTable,
+    occupancy: RunTable | None,
     t0_ns: int,
     T_world_base: Floats | None = None,
     worst: Deviation | None = None,
@@ -89,9 +89,7 @@ def path(
     return figure
 
 
-def deviation(
-    motion: pd.DataFrame, occupancy: pd.DataFrame | None, t0_ns: int, worst: Deviation | None = None
-) -> Figure:
+def deviation(motion: RunTable, occupancy: RunTable | None, t0_ns: int, worst: Deviation | None = None) -> Figure:
     """Fig. 13b: draws the largest deviation in its vertical plane, so that its length is not distorted.
 
     Args:
@@ -151,7 +149,7 @@ def _path_legend(figure: Figure, *, with_limbs: bool, with_base: bool) -> None:
     figure.legend(handles=handles, loc="lower center", bbox_to_anchor=(0.5, 0.04 / height), ncols=4)
 
 
-def _limbs_at(occupancy: pd.DataFrame | None, motion: pd.DataFrame, worst: Deviation) -> Limbs:
+def _limbs_at(occupancy: RunTable | None, motion: RunTable, worst: Deviation) -> Limbs:
     """Returns the volumes stored last before the deviation; none before the first."""
     t_ns = int(times(motion)[worst.row])
     if occupancy is None or not (times(occupancy) <= t_ns).any():
@@ -159,7 +157,7 @@ def _limbs_at(occupancy: pd.DataFrame | None, motion: pd.DataFrame, worst: Devia
     return stored_at(occupancy, t_ns)[1]
 
 
-def _draw_path(ax: Axes, view: View, motion: pd.DataFrame, limbs: Limbs, worst: Deviation) -> None:
+def _draw_path(ax: Axes, view: View, motion: RunTable, limbs: Limbs, worst: Deviation) -> None:
     reference, tcp = position_columns(motion, "ref"), position_columns(motion, "tcp")
     draw_outlines(ax, limbs, view)
     seconds = seconds_from(times(motion), int(times(motion)[worst.row]))
@@ -173,7 +171,7 @@ def _draw_path(ax: Axes, view: View, motion: pd.DataFrame, limbs: Limbs, worst: 
     ax.plot(*ends[1], "o", color=drawing.ACTUAL, ms=3.5, zorder=7)
 
 
-def speed(motion: pd.DataFrame, t0_ns: int, near_m: float) -> Figure:
+def speed(motion: RunTable, t0_ns: int, near_m: float) -> Figure:
     """Fig. 14: draws programmed speed; actual speed with braking shaded; separation from the swept volumes."""
     seconds = seconds_from(times(motion), t0_ns)
     figure = drawing.column_figure(3.3)
@@ -199,7 +197,7 @@ def speed(motion: pd.DataFrame, t0_ns: int, near_m: float) -> Figure:
     return figure
 
 
-def horizon(motion: pd.DataFrame, t0_ns: int, stop_s: float) -> Figure:
+def horizon(motion: RunTable, t0_ns: int, stop_s: float) -> Figure:
     """Draws the horizon of the volumes used at each tick, and the duration of the stop from its velocity.
 
     Args:
@@ -224,13 +222,13 @@ def horizon(motion: pd.DataFrame, t0_ns: int, stop_s: float) -> Figure:
 _BRAKING = Patch(color=drawing.STATUS["braking"], alpha=0.25, lw=0, label="braking")
 
 
-def _top(motion: pd.DataFrame, name: str) -> float:
+def _top(motion: RunTable, name: str) -> float:
     values = numeric_column(motion, name)
     values = values[np.isfinite(values)]
     return max(float(values.max()), 1e-3) if len(values) else 1.0
 
 
-def _shade(ax: Axes, seconds: Floats, motion: pd.DataFrame, status: str) -> None:
+def _shade(ax: Axes, seconds: Floats, motion: RunTable, status: str) -> None:
     bars = _bars(seconds, (motion["status"] == status).to_numpy(dtype=bool))
     ax.broken_barh(
         bars, (0, 1), transform=ax.get_xaxis_transform(), facecolors=drawing.STATUS[status], alpha=0.2, lw=0, zorder=0
@@ -251,8 +249,8 @@ def _bars(seconds: Floats, mask: Bools) -> list[tuple[float, float]]:
 
 
 def status(
-    motion: pd.DataFrame,
-    baselines: Mapping[str, pd.DataFrame],
+    motion: RunTable,
+    baselines: Mapping[str, RunTable],
     *,
     method: str,
     t0_ns: int,

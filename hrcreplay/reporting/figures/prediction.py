@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
@@ -23,6 +22,7 @@ from hrcreplay.reporting.figures.scene import ABOVE, View, bones, bounds_of, dra
 from hrcreplay.reporting.metrics.planning import numeric_column
 from hrcreplay.reporting.metrics.series import columns, times
 from hrcreplay.reporting.tables import part_name_text
+from hrcreplay.store.stored_table import RunTable
 
 #: Maximum age of stored volumes, and of people, at an instant [s].
 STALE_S = 0.2
@@ -176,7 +176,7 @@ def hull_of(points: Floats) -> Floats:
         return points
 
 
-def stored_at(occupancy: pd.DataFrame, t_ns: int) -> tuple[pd.DataFrame, Limbs]:
+def stored_at(occupancy: RunTable, t_ns: int) -> tuple[RunTable, Limbs]:
     """Returns the volumes stored last at or before an instant, else the first: their rows, and the same as Limbs."""
     stored = np.unique(times(occupancy))
     at_ns = stored[max(0, int(np.searchsorted(stored, t_ns, side="right")) - 1)]
@@ -188,7 +188,7 @@ def stored_at(occupancy: pd.DataFrame, t_ns: int) -> tuple[pd.DataFrame, Limbs]:
     return rows, limbs
 
 
-def volumes_at(occupancy: pd.DataFrame, people: Sequence[pd.DataFrame], moment_ns: int, t0_ns: int) -> Figure:
+def volumes_at(occupancy: RunTable, people: Sequence[RunTable], moment_ns: int, t0_ns: int) -> Figure:
     """Fig. 9: draws the swept volumes that the run used at one instant, from the front of person 1 and from above.
 
     Args:
@@ -216,7 +216,7 @@ def volumes_at(occupancy: pd.DataFrame, people: Sequence[pd.DataFrame], moment_n
     return figure
 
 
-def volumes(instants: Sequence[Instant], state: pd.DataFrame, t0_ns: int) -> Figure:
+def volumes(instants: Sequence[Instant], state: RunTable, t0_ns: int) -> Figure:
     """Fig. 17: draws the person's swept volumes, one row per method, one column per instant, with one scale.
 
     Args:
@@ -268,14 +268,15 @@ def volumes(instants: Sequence[Instant], state: pd.DataFrame, t0_ns: int) -> Fig
     return figure
 
 
-def skeleton_at(state: pd.DataFrame, t_ns: int) -> tuple[Floats, float]:
+def skeleton_at(state: RunTable, t_ns: int) -> tuple[Floats, float]:
     """Returns (20, 3) points of the fused person at the tick nearest to an instant [m], and the heading [rad]."""
-    row = state.iloc[[int(np.argmin(np.abs(times(state) - t_ns)))]]
+    nearest = int(np.argmin(np.abs(times(state) - t_ns)))
+    row = state.iloc[nearest : nearest + 1]
     p = columns(row)
     return skeleton(p, row[list(LENGTHS)].to_numpy(dtype=float))[0], float(p[0, JOINTS.index("theta")])
 
 
-def skeletons_at(people: Sequence[pd.DataFrame], t_ns: int) -> list[Floats]:
+def skeletons_at(people: Sequence[RunTable], t_ns: int) -> list[Floats]:
     """Returns (20, 3) points of each fused person who is there at an instant [m]: nobody from before or after."""
     there = [state for state in people if np.abs(times(state) - t_ns).min(initial=2**62) <= STALE_S * 1e9]
     return [skeleton_at(state, t_ns)[0] for state in there]
@@ -325,7 +326,7 @@ def _at(t_ns: int, t0_ns: int) -> str:
     return f"At {(t_ns - t0_ns) * 1e-9:.1f} s"
 
 
-def growth(found: Growth, occupancy: pd.DataFrame | None, t0_ns: int) -> Figure:
+def growth(found: Growth, occupancy: RunTable | None, t0_ns: int) -> Figure:
     """Draws the six limbs' volumes against the horizon: by each method at one instant, and as used (dots).
 
     Args:
@@ -358,9 +359,10 @@ def growth(found: Growth, occupancy: pd.DataFrame | None, t0_ns: int) -> Figure:
     return figure
 
 
-def stored_sums(occupancy: pd.DataFrame) -> tuple[Floats, Floats]:
+def stored_sums(occupancy: RunTable) -> tuple[Floats, Floats]:
     """Returns (n,) horizon [s] and (n,) total volume of the six limbs [m^3] at every stored instant with all six."""
-    six = occupancy[occupancy["limb"].isin(LIMBS)]
+    sizes = occupancy[["t_ns", "limb", "horizon_s", "volume_m3"]]
+    six = sizes[sizes["limb"].isin(LIMBS)]
     by_tick = six.groupby("t_ns", sort=True)
     count = by_tick["volume_m3"].count().to_numpy()
     horizon_s, volume_m3 = (by_tick[name].agg(how) for name, how in (("horizon_s", "first"), ("volume_m3", "sum")))

@@ -5,10 +5,10 @@ An event is a full stop of a method, or a contact of its moving robot with the r
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import pandas as pd
 
 from hrcreplay.evaluation.contact import deciding_rows
 from hrcreplay.evaluation.severity import merged_runs
@@ -17,6 +17,7 @@ from hrcreplay.reporting.metrics.planning import is_moving, method_text, numeric
 from hrcreplay.reporting.metrics.series import MetricTable, durations_s, times
 from hrcreplay.settings.sections import setting
 from hrcreplay.store.run_folder import Run
+from hrcreplay.store.stored_table import RunTable
 
 #: Source of the recorded person, as in contact.parquet, and in words.
 PERSONS = {
@@ -49,7 +50,7 @@ def method_prefixes(run: Run) -> dict[str, str]:
     }
 
 
-def motion_of(run: Run, prefix: str) -> pd.DataFrame:
+def motion_of(run: Run, prefix: str) -> RunTable:
     """Returns the table of motion of a method, by the prefix of its metrics."""
     found = {"plan": run.motion, RECORDED: run.recorded}.get(prefix)
     return run.baselines[prefix.removeprefix("baseline_")] if found is None else found
@@ -118,7 +119,7 @@ def _add_people(metrics: MetricTable, run: Run) -> None:
         )
 
 
-def _is_whole(body: pd.DataFrame, part: str) -> Bools:
+def _is_whole(body: RunTable, part: str) -> Bools:
     """(n,) True if both ends of a part are known; a part with one known end is a ball."""
     if f"{part}_0_x" not in body:
         return np.zeros(len(body), dtype=np.bool_)
@@ -127,7 +128,7 @@ def _is_whole(body: pd.DataFrame, part: str) -> Bools:
     return np.asarray(apart > 0.0)
 
 
-def _add_stops(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: str, slow: float) -> None:
+def _add_stops(metrics: MetricTable, prefix: str, motion: RunTable, what: str, slow: float) -> None:
     """Adds full stops, ticks without a certificate, horizons, and reasons for standing without braking."""
     status, moving = motion["status"].astype(str).to_numpy(), is_moving(motion, slow)
     stops = (status == "braking") & moving
@@ -170,7 +171,7 @@ def _add_stops(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: st
         )
 
 
-def _add_touch(metrics: MetricTable, prefix: str, rows: pd.DataFrame, what: str) -> None:
+def _add_touch(metrics: MetricTable, prefix: str, rows: RunTable, what: str) -> None:
     """Adds number, duration and speed of the robot's contacts."""
     distance, moving = numeric_column(rows, "distance_m"), rows["moving"].to_numpy(dtype=bool)
     person, other = (numeric_column(rows, f"{who}_m") for who in ("person", "other"))
@@ -220,7 +221,7 @@ def _add_touch(metrics: MetricTable, prefix: str, rows: pd.DataFrame, what: str)
         )
 
 
-def _add_nearest(metrics: MetricTable, prefix: str, rows: pd.DataFrame, what: str) -> None:
+def _add_nearest(metrics: MetricTable, prefix: str, rows: RunTable, what: str) -> None:
     """Adds the smallest distance while moving and at rest, and its link and body part."""
     distance, moving = numeric_column(rows, "distance_m"), rows["moving"].to_numpy(dtype=bool)
     for name, which, state in (("moving", moving, "moving"), ("rest", ~moving, "at rest")):
@@ -252,15 +253,13 @@ def _least(distance: Floats, which: Bools) -> int | None:
     return int(np.argmin(np.where(known, distance, np.inf))) if known.any() else None
 
 
-def retreats(motion: pd.DataFrame, t_ns: Ints) -> Bools:
+def retreats(motion: RunTable, t_ns: Ints) -> Bools:
     """Marks the ticks (n,) at which the motion was a retreat, or the stop of one."""
     decided = deciding_rows(motion)[np.searchsorted(times(motion), t_ns)]
     return np.asarray((decided >= 0) & (motion["status"].astype(str).to_numpy()[decided] == "retreating"))
 
 
-def _add_faults(
-    metrics: MetricTable, prefix: str, rows: pd.DataFrame, what: str, motion: pd.DataFrame, *, blind: str
-) -> None:
+def _add_faults(metrics: MetricTable, prefix: str, rows: RunTable, what: str, motion: RunTable, *, blind: str) -> None:
     """Classifies contacts while moving: inside or outside the predicted volumes; ``blind``: why they are neither."""
     touch = (numeric_column(rows, "person_m") <= 0.0) & rows["moving"].to_numpy(dtype=bool)
     outside, retreat = numeric_column(rows, "outside_m")[touch], retreats(motion, times(rows)[touch])
@@ -288,7 +287,7 @@ def _add_faults(
         )
 
 
-def _add_left(metrics: MetricTable, contact: pd.DataFrame) -> None:
+def _add_left(metrics: MetricTable, contact: RunTable) -> None:
     """Adds the number of times the person left the volumes before their horizon, and before the braking time."""
     until = {"volumes": ("left", "the tick's horizon"), "volumes_full": ("left_full", "the braking time T_s")}
     for prefix, (column, end) in until.items():
@@ -351,9 +350,7 @@ class StopEvent:
     reason: str
 
 
-def stop_events(
-    motion: pd.DataFrame, contact: pd.DataFrame | None, t0_ns: int, slow_m_per_s: float
-) -> tuple[StopEvent, ...]:
+def stop_events(motion: RunTable, contact: RunTable | None, t0_ns: int, slow_m_per_s: float) -> tuple[StopEvent, ...]:
     """Returns the events of a method, in order of time.
 
     Args:
@@ -368,17 +365,16 @@ def stop_events(
     return tuple(sorted(found, key=lambda event: (event.at_s, event.kind)))
 
 
-def _stops(motion: pd.DataFrame, t0_ns: int, slow: float) -> list[StopEvent]:
+def _stops(motion: RunTable, t0_ns: int, slow: float) -> list[StopEvent]:
     t_ns, lasts_s = times(motion), durations_s(times(motion))
     moving = is_moving(motion, slow)
     braking = motion["status"].astype(str).to_numpy() == "braking"
     speed, distance = (numeric_column(motion, name) for name in ("tcp_speed", "distance_m"))
-    stopping = braking & moving
+    stopping, names = braking & moving, _names(motion)
     found = []
     for first, last in merged_runs(stopping, t_ns):
         goes_on = np.flatnonzero(moving[last:])
         again = last + int(goes_on[0]) if len(goes_on) else len(t_ns)
-        row = motion.iloc[first]
         found.append(
             StopEvent(
                 kind="stop",
@@ -387,22 +383,21 @@ def _stops(motion: pd.DataFrame, t0_ns: int, slow: float) -> list[StopEvent]:
                 rest_s=float(lasts_s[last:again].sum()),
                 speed_m_per_s=float(speed[first]),
                 distance_m=float(distance[first]),
-                link=_text(row.get("link")),
-                limb=_text(row.get("limb")),
-                reason=_text(row.get("reason")),
+                link=names["link"][first],
+                limb=names["limb"][first],
+                reason=names["reason"][first],
             )
         )
     return found
 
 
-def _touches(contact: pd.DataFrame, t0_ns: int) -> list[StopEvent]:
+def _touches(contact: RunTable, t0_ns: int) -> list[StopEvent]:
     t_ns, lasts_s = times(contact), durations_s(times(contact))
     distance, speed = (numeric_column(contact, name) for name in ("distance_m", "contact_speed"))
-    touching = contact["moving"].to_numpy(dtype=bool) & (distance <= 0.0)
+    touching, names = contact["moving"].to_numpy(dtype=bool) & (distance <= 0.0), _names(contact)
     found = []
     for first, last in merged_runs(touching, t_ns):
         at = first + int(np.nanargmin(np.where(touching[first:last], distance[first:last], np.inf)))
-        row = contact.iloc[at]
         found.append(
             StopEvent(
                 kind="touch",
@@ -411,13 +406,16 @@ def _touches(contact: pd.DataFrame, t0_ns: int) -> list[StopEvent]:
                 rest_s=0.0,
                 speed_m_per_s=float(speed[first:last][touching[first:last]].max()),
                 distance_m=float(distance[at]),
-                link=_text(row.get("link")),
-                limb=_text(row.get("limb")),
+                link=names["link"][at],
+                limb=names["limb"][at],
                 reason="",
             )
         )
     return found
 
 
-def _text(value: object) -> str:
-    return value if isinstance(value, str) else ""
+def _names(table: RunTable) -> Mapping[str, Sequence[str]]:
+    """Returns the names in each row of a table, by column; empty where there is none, and in a column that it lacks."""
+    columns = [name for name in ("link", "limb", "reason") if name in table]
+    nothing = dict.fromkeys(("link", "limb", "reason"), [""] * len(table))
+    return nothing | {name: table[name].fillna("").astype(str).to_list() for name in columns}

@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import pandas as pd
 
 from hrcreplay.records import BODY, JOINTS, LIMBS, Bools, Floats, Ints
 from hrcreplay.reporting.metrics.series import (
@@ -27,6 +26,7 @@ from hrcreplay.reporting.metrics.series import (
 from hrcreplay.reporting.tables import LIMB_NAMES
 from hrcreplay.settings.sections import setting
 from hrcreplay.store.run_folder import Run
+from hrcreplay.store.stored_table import RunTable
 
 
 def cameras(run: Run) -> list[str]:
@@ -65,7 +65,7 @@ def _add_span(metrics: MetricTable, run: Run) -> None:
     metrics.add("ticks", len(t_ns) or None, "1", "ticks of the filter and the controller", reason=reason)
 
 
-def _add_frames(metrics: MetricTable, measurements: pd.DataFrame | None, camera: str, gap_s: float) -> None:
+def _add_frames(metrics: MetricTable, measurements: RunTable | None, camera: str, gap_s: float) -> None:
     reason = "the run has no table of measurements"
     frames = rate = gaps = longest = None
     if measurements is not None:
@@ -83,7 +83,7 @@ def _add_frames(metrics: MetricTable, measurements: pd.DataFrame | None, camera:
     metrics.add(f"{name}_gap_max_s", longest, "s", f"longest time between captures of {camera}", reason=reason)
 
 
-def _add_validity(metrics: MetricTable, state: pd.DataFrame | None, camera: str, gap_s: float) -> None:
+def _add_validity(metrics: MetricTable, state: RunTable | None, camera: str, gap_s: float) -> None:
     used = recent = None
     if state is not None and f"valid_{camera}" in state:
         valid = state[f"valid_{camera}"].to_numpy(dtype=bool)
@@ -105,7 +105,7 @@ def _add_validity(metrics: MetricTable, state: pd.DataFrame | None, camera: str,
     )
 
 
-def _add_heights(metrics: MetricTable, bodies: pd.DataFrame | None, camera: str) -> None:
+def _add_heights(metrics: MetricTable, bodies: RunTable | None, camera: str) -> None:
     found = None if bodies is None else bodies[bodies["camera"] == camera]
     texts = {
         "floor_m": "height of the person's lowest foot above the floor z = 0",
@@ -120,7 +120,7 @@ def _add_heights(metrics: MetricTable, bodies: pd.DataFrame | None, camera: str)
         metrics.add(f"camera_{camera}_{name}", value, "m", f"{text}, by {camera}{middle}", reason=reason)
 
 
-def add_agreement(metrics: MetricTable, agreement: pd.DataFrame | None) -> None:
+def add_agreement(metrics: MetricTable, agreement: RunTable | None) -> None:
     """Adds the distance between the views of any two cameras, for each limb of BODY at the same instants."""
     for limb in BODY:
         rows = None if agreement is None else agreement[agreement["limb"] == limb]
@@ -135,14 +135,14 @@ def add_agreement(metrics: MetricTable, agreement: pd.DataFrame | None) -> None:
             )
 
 
-def seconds_since(state: pd.DataFrame, valid: Bools) -> Floats:
+def seconds_since(state: RunTable, valid: Bools) -> Floats:
     """(n,) time since the last valid tick, 0 at one [s]; infinite before the first."""
     t_ns = times(state)
     last = np.maximum.accumulate(np.where(valid, np.arange(len(valid)), -1))
     return np.where(last < 0, np.inf, (t_ns - t_ns[np.maximum(last, 0)]) * 1e-9)
 
 
-def _add_coverage(metrics: MetricTable, state: pd.DataFrame) -> None:
+def _add_coverage(metrics: MetricTable, state: RunTable) -> None:
     names = [name for name in state.columns if name.startswith("valid_")]
     any_valid: Bools = np.asarray(state[names].to_numpy(dtype=bool).any(axis=1))
     t_ns = times(state)
@@ -164,7 +164,7 @@ def _add_coverage(metrics: MetricTable, state: pd.DataFrame) -> None:
     metrics.add("ticks_state_lost", int(lost.sum()), "1", "ticks after the first full state without a finite one")
 
 
-def _add_known(metrics: MetricTable, state: pd.DataFrame, fresh_s: float | None) -> None:
+def _add_known(metrics: MetricTable, state: RunTable, fresh_s: float | None) -> None:
     """Adds the share of ticks at which the person, and each limb, was known from fresh frames."""
     known = fresh_s is not None and "frame_age_s" in state
     fresh = state["frame_age_s"].to_numpy(dtype=float) <= fresh_s if known else None
@@ -226,13 +226,15 @@ def _add_watched(metrics: MetricTable, run: Run) -> None:
     metrics.add("watched_speed_m_per_s", speed, "m/s", "assumed speed of people who walk in", reason=reason)
 
 
-def add_occupancy(metrics: MetricTable, occupancy: pd.DataFrame | None) -> None:
+def add_occupancy(metrics: MetricTable, occupancy: RunTable | None) -> None:
     """Adds the mean swept volume per method and limb, and the sum over all limbs of a tick."""
     if occupancy is None:
         metrics.add("occupancy_ticks", None, "1", "ticks with stored swept volumes", reason="not predicted")
         return
     metrics.add("occupancy_ticks", int(occupancy["t_ns"].nunique()), "1", "ticks with stored swept volumes")
-    for method, rows in occupancy.groupby("method", sort=True):
+    sizes = occupancy[["t_ns", "limb", "method", "volume_m3"]]
+    for method in sorted(set(sizes["method"])):
+        rows = sizes[sizes["method"] == method]
         for limb in (*LIMBS, *sorted(set(rows["limb"]) - set(LIMBS))):
             volume = rows.loc[rows["limb"] == limb, "volume_m3"].to_numpy(dtype=float)
             volume = volume[np.isfinite(volume)]
@@ -464,7 +466,7 @@ def add_limbs(metrics: MetricTable, run: Run) -> None:
         )
 
 
-def _never_measured(measurements: pd.DataFrame | None) -> frozenset[str]:
+def _never_measured(measurements: RunTable | None) -> frozenset[str]:
     if measurements is None or not len(measurements):
         return frozenset()
     return frozenset(joint for joint in JOINTS if not np.isfinite(measurements[joint].to_numpy(dtype=float)).any())

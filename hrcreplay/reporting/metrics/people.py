@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import numpy as np
-import pandas as pd
 
 from hrcreplay.records import of_person
 from hrcreplay.reporting.metrics.contact import method_prefixes
 from hrcreplay.reporting.metrics.planning import numeric_column
 from hrcreplay.reporting.metrics.series import MetricTable, times
 from hrcreplay.store.run_folder import Run
+from hrcreplay.store.stored_table import RunTable
 
 #: Name of the metric that counts them, where there are several.
 TRACKED = "people_tracked"
 
 
-def named_volumes(occupancy: pd.DataFrame | None) -> pd.DataFrame | None:
+def named_volumes(occupancy: RunTable | None) -> RunTable | None:
     """Returns the volumes of all people, each limb named with its person; the table itself for one person."""
     if occupancy is None or "person" not in occupancy:
         return occupancy
@@ -49,7 +49,7 @@ def add_people(metrics: MetricTable, run: Run) -> None:
                 )
 
 
-def _add_times(metrics: MetricTable, number: int, rows: pd.DataFrame, state: pd.DataFrame) -> None:
+def _add_times(metrics: MetricTable, number: int, rows: RunTable, state: RunTable) -> None:
     """Adds from when to when the person is there, and the share of these ticks with a fused state."""
     known = np.isfinite(numeric_column(rows, "x"))
     seconds = (times(rows) - times(state)[0]) * 1e-9
@@ -65,7 +65,7 @@ def _add_times(metrics: MetricTable, number: int, rows: pd.DataFrame, state: pd.
     )
 
 
-def _add_distance(metrics: MetricTable, stem: str, rows: pd.DataFrame, number: int) -> None:
+def _add_distance(metrics: MetricTable, stem: str, rows: RunTable, number: int) -> None:
     """Adds the smallest distance of the moving robot, and its contacts."""
     column = f"person_{number}_m"
     if column not in rows:
@@ -88,7 +88,7 @@ def _add_distance(metrics: MetricTable, stem: str, rows: pd.DataFrame, number: i
     )
 
 
-def _add_held(metrics: MetricTable, number: int, rows: pd.DataFrame) -> None:
+def _add_held(metrics: MetricTable, number: int, rows: RunTable) -> None:
     """Adds the share of the checked ticks at which the person stayed inside the volumes."""
     for name, column in (("volumes", "left_person"), ("volumes_full", "left_full_person")):
         if f"{column}_{number}_m" not in rows:

@@ -8,14 +8,17 @@ time at the foot point is the progress of the robot.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 
+from hrcreplay.geometry.polyline import advance_foot
 from hrcreplay.records import RECORDED, STATUSES, Bools, Floats, Ints
 from hrcreplay.reporting.metrics.series import MetricTable, durations_s, path_feet, times
 from hrcreplay.robot.recorded import UNKNOWN
+from hrcreplay.store.stored_table import RunTable
 
 #: Shorter distances are rounding [m].
 _ROUNDING_M = 1e-9
@@ -59,23 +62,8 @@ def foot(path: Programme, tcp_m: Floats, ahead_m: float) -> tuple[int, float]:
     Returns:
         The last passed point of the path, and the fraction of the distance to the next one.
     """
-    passed, share, before = 0, 0.0, tcp_m[0].tolist()
-    for tick, (here, reference) in enumerate(zip(tcp_m.tolist(), path.at.tolist(), strict=True), start=1):
-        waits = tick < len(tcp_m) and sum((a - b) ** 2 for a, b in zip(here, before, strict=True)) < _STEP_M**2
-        if waits or passed == reference:
-            continue
-        before, tcp = here, tcp_m[tick - 1]
-        here_m = path.way_m[passed] + share * (path.way_m[passed + 1] - path.way_m[passed])
-        end = min(reference, max(passed + 1, int(np.searchsorted(path.way_m, here_m + ahead_m))))
-        start = path.points_m[passed:end]
-        along = path.points_m[passed + 1 : end + 1] - start
-        part = np.clip(((tcp - start) * along).sum(axis=1) / (along**2).sum(axis=1), 0.0, 1.0)
-        part[0] = max(part[0], share)
-        nearest = int(np.argmin(((start + part[:, None] * along - tcp) ** 2).sum(axis=1)))
-        passed, share = passed + nearest, float(part[nearest])
-        if share == 1.0:
-            passed, share = passed + 1, 0.0
-    return passed, share
+    tcp_m, points_m = np.ascontiguousarray(tcp_m), np.ascontiguousarray(path.points_m)
+    return advance_foot(tcp_m, points_m, path.way_m, path.at, ahead_m, _STEP_M)
 
 
 def reached_s(path: Programme, passed: int, share: float) -> float:
@@ -91,7 +79,7 @@ def reached_s(path: Programme, passed: int, share: float) -> float:
     return float(time_s - path.from_s[0]) if made_m > _ROUNDING_M else 0.0
 
 
-def programme_progress(motion: pd.DataFrame, ahead_m: float) -> tuple[float, float] | None:
+def programme_progress(motion: RunTable, ahead_m: float) -> tuple[float, float] | None:
     """Returns the programmed time that the robot reached, and the available time [s]; None for a stationary programme.
 
     Args:
@@ -124,17 +112,17 @@ PAPER = {
 }
 
 
-def position_columns(motion: pd.DataFrame, what: str) -> Floats:
+def position_columns(motion: RunTable, what: str) -> Floats:
     """Returns (n, 3) ``ref`` or ``tcp`` positions, world [m]."""
     return motion[[f"{what}_x", f"{what}_y", f"{what}_z"]].to_numpy(dtype=float)
 
 
-def numeric_column(motion: pd.DataFrame, name: str) -> Floats:
+def numeric_column(motion: RunTable, name: str) -> Floats:
     """Returns one column (n,)."""
     return motion[name].to_numpy(dtype=float)
 
 
-def stationary(motion: pd.DataFrame, near_m: float, stationary_m_per_s: float) -> tuple[Bools, Bools]:
+def stationary(motion: RunTable, near_m: float, stationary_m_per_s: float) -> tuple[Bools, Bools]:
     """Marks the near ticks (separation at most ``near_m``), and all ticks at which the robot stands but should move.
 
     The robot stands if the TCP is slower than ``stationary_m_per_s``. It should move if the reference moves, or if the
@@ -147,20 +135,20 @@ def stationary(motion: pd.DataFrame, near_m: float, stationary_m_per_s: float) -
     return near, stands & (wanted | waits)
 
 
-def is_moving(motion: pd.DataFrame, slow_m_per_s: float) -> Bools:
+def is_moving(motion: RunTable, slow_m_per_s: float) -> Bools:
     """(n,) True if the robot moves: its TCP, or any joint at 1 mrad/s, as links can move while the TCP stands."""
     joints = [name for name in motion.columns if name.startswith("dq")]
     turning = (np.abs(motion[joints].to_numpy(dtype=float)) >= 1e-3).any(axis=1)
     return np.asarray((numeric_column(motion, "tcp_speed") >= slow_m_per_s) | turning)
 
 
-def deviation_m(motion: pd.DataFrame) -> Floats:
+def deviation_m(motion: RunTable) -> Floats:
     """(n,) distance of the TCP from the programmed path [m]."""
     tcp = position_columns(motion, "tcp")
     return np.asarray(np.linalg.norm(tcp - path_feet(tcp, position_columns(motion, "ref")), axis=1))
 
 
-def waited_s(motion: pd.DataFrame) -> Floats:
+def waited_s(motion: RunTable) -> Floats:
     """(n,) time in each tick during which the reference waited for the robot [s]; 0 after the last tick."""
     waited = durations_s(times(motion))
     waited[:-1] -= np.diff(numeric_column(motion, "programme_s"))
@@ -168,7 +156,7 @@ def waited_s(motion: pd.DataFrame) -> Floats:
     return np.clip(waited, 0.0, None)
 
 
-def cycles(motion: pd.DataFrame, *, at_m: float = 0.002, away_m: float = 0.05) -> int:
+def cycles(motion: RunTable, *, at_m: float = 0.002, away_m: float = 0.05) -> int:
     """Counts returns of the reference to its first point (within ``at_m``) after being ``away_m`` from it."""
     reference = position_columns(motion, "ref")
     gap = np.linalg.norm(reference - reference[0], axis=1)
@@ -179,15 +167,15 @@ def cycles(motion: pd.DataFrame, *, at_m: float = 0.002, away_m: float = 0.05) -
 
 def add_plan(
     metrics: MetricTable,
-    motion: pd.DataFrame | None,
-    baselines: dict[str, pd.DataFrame],
+    motion: RunTable | None,
+    baselines: Mapping[str, RunTable],
     *,
     method: str,
     near_m: float,
     stationary_m_per_s: float,
     max_reference_lead_m: float,
-    contact: pd.DataFrame | None = None,
-    recorded: pd.DataFrame | None = None,
+    contact: RunTable | None = None,
+    recorded: RunTable | None = None,
 ) -> None:
     """Adds all metrics of the motion and of the baselines, and the paper's own figures.
 
@@ -230,9 +218,7 @@ def method_text(prefix: str) -> str:
     return "the plan" if prefix == "plan" else f"the baseline '{prefix.removeprefix('baseline_')}'"
 
 
-def _add_recorded(
-    metrics: MetricTable, motion: pd.DataFrame, contact: pd.DataFrame | None, near_m: float, slow: float
-) -> None:
+def _add_recorded(metrics: MetricTable, motion: RunTable, contact: RunTable | None, near_m: float, slow: float) -> None:
     """Adds the metrics of the robot as recorded: of its known ticks only, and their number."""
     what, known = method_text(RECORDED), np.isfinite(numeric_column(motion, "tcp_x"))
     metrics.add("recorded_ticks", len(motion), "1", f"ticks of {what}, known or not")
@@ -266,7 +252,7 @@ def _slug(reason: str) -> str:
     return "_".join("".join(c if c.isalnum() else " " for c in reason.lower()).split())
 
 
-def _add_status(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: str, slow: float) -> None:
+def _add_status(metrics: MetricTable, prefix: str, motion: RunTable, what: str, slow: float) -> None:
     status = motion["status"].astype(str).to_numpy()
     moving = is_moving(motion, slow)
     braking = status == "braking"
@@ -320,7 +306,7 @@ def _add_status(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: s
     )
 
 
-def _add_separation(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: str, slow: float) -> None:
+def _add_separation(metrics: MetricTable, prefix: str, motion: RunTable, what: str, slow: float) -> None:
     distance = numeric_column(motion, "distance_m")
     known = np.isfinite(distance)
     reason = "no tick has a separation"
@@ -349,9 +335,7 @@ def _add_separation(metrics: MetricTable, prefix: str, motion: pd.DataFrame, wha
     metrics.add(f"{name}_unknown_ticks", int((~known).sum()), "1", f"ticks of {what} without a separation")
 
 
-def _add_stationary(
-    metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: str, near_m: float, slow: float
-) -> None:
+def _add_stationary(metrics: MetricTable, prefix: str, motion: RunTable, what: str, near_m: float, slow: float) -> None:
     near, stands = stationary(motion, near_m, slow)
     both = int((near & stands).sum())
     metrics.add(f"{prefix}_near_ticks", int(near.sum()), "1", f"ticks of {what} with a separation <= {near_m:g} m")
@@ -385,7 +369,7 @@ def _add_stationary(
     )
 
 
-def _add_path(metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: str) -> None:
+def _add_path(metrics: MetricTable, prefix: str, motion: RunTable, what: str) -> None:
     along = np.linalg.norm(position_columns(motion, "tcp") - position_columns(motion, "ref"), axis=1)
     for name, values, meaning in (
         ("deviation", deviation_m(motion), "distance from the TCP to the nearest point of the programmed path"),
@@ -402,7 +386,7 @@ def _p95(values: Floats) -> float:
 
 
 def _add_fastest(
-    metrics: MetricTable, prefix: str, motion: pd.DataFrame, contact: pd.DataFrame | None, what: str, near_m: float
+    metrics: MetricTable, prefix: str, motion: RunTable, contact: RunTable | None, what: str, near_m: float
 ) -> None:
     """Adds the maximum speeds: of the TCP, of the TCP near the recorded body, and of the programme."""
     speeds = {
@@ -430,9 +414,7 @@ def _add_fastest(
         )
 
 
-def _add_progress(
-    metrics: MetricTable, prefix: str, motion: pd.DataFrame, what: str, max_reference_lead_m: float
-) -> None:
+def _add_progress(metrics: MetricTable, prefix: str, motion: RunTable, what: str, max_reference_lead_m: float) -> None:
     tcp_speed, ref_speed = numeric_column(motion, "tcp_speed"), numeric_column(motion, "ref_speed")
     for name, speed, meaning in (
         ("tcp_speed", tcp_speed, "speed of the TCP"),

@@ -8,13 +8,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from scipy.spatial import cKDTree
 
 from hrcreplay.geometry.polyline import follow_nearer
 from hrcreplay.human.model import nearest
 from hrcreplay.records import JOINTS, Bools, Floats, Ints, find_neighbours
 from hrcreplay.store.run_folder import Run
+from hrcreplay.store.stored_table import RunTable
 
 Metric = dict[str, Any]
 
@@ -66,12 +66,12 @@ def difference(a: Floats, b: Floats) -> Floats:
     return np.where(IS_ANGLE, wrap(apart), apart)
 
 
-def columns(table: pd.DataFrame, suffix: str = "") -> Floats:
+def columns(table: RunTable, suffix: str = "") -> Floats:
     """Returns the (n, 13) columns of the JOINTS with a suffix."""
     return table[[joint + suffix for joint in JOINTS]].to_numpy(dtype=float)
 
 
-def times(table: pd.DataFrame, name: str = "t_ns") -> Ints:
+def times(table: RunTable, name: str = "t_ns") -> Ints:
     """Returns a column of instants (n,) [ns]."""
     return table[name].to_numpy(dtype=np.int64)
 
@@ -175,6 +175,8 @@ def thin_stretches(points: Floats, tolerance: float) -> list[Floats]:
 #: Edge of the cells in which vertices of a path are searched together, and distance below which vertices are merged
 #: [m].
 _CELL_M, _SAME_M = 2e-4, 1e-6
+#: Vertices in each leaf of their tree: more than usual, as a point far from the path is near to many of them.
+_LEAF = 64
 
 
 def path_feet(points: Floats, path: Floats) -> Floats:
@@ -209,9 +211,11 @@ def _nearest_vertices(points: Floats, path: Floats) -> Ints:
     A programme passes the same places in each cycle, and a tree of all these vertices is slow: only one vertex per cell
     is tested, and from there the search follows the path while the distance decreases.
     """
-    _, first = np.unique(np.floor(path / _CELL_M).astype(np.int64), axis=0, return_index=True)
+    cells = np.floor(path / _CELL_M).astype(np.int64)
+    cells -= cells.min(axis=0)
+    _, first = np.unique(np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1)), return_index=True)
     vertices = np.sort(first)
-    found: Ints = vertices[cKDTree(path[vertices]).query(points)[1]].astype(np.int64)
+    found: Ints = vertices[cKDTree(path[vertices], leafsize=_LEAF).query(points)[1]].astype(np.int64)
     follow_nearer(np.ascontiguousarray(points), np.ascontiguousarray(path), found)
     return found
 
@@ -270,7 +274,7 @@ def instants(run: Run, count: int = 4, step_s: float = 1.0) -> Ints:
     return found if len(np.unique(found)) == count else np.zeros(0, dtype=np.int64)
 
 
-def nearest_tick(motion: pd.DataFrame) -> int:
+def nearest_tick(motion: RunTable) -> int:
     """Returns the row of the smallest separation of a plan; the first if none is known."""
     distance_m = motion["distance_m"].to_numpy(dtype=float)
     return int(np.argmin(np.where(np.isnan(distance_m), np.inf, distance_m)))

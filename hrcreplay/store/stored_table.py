@@ -1,0 +1,179 @@
+"""A table of a run folder that is read column by column when asked for, so that a long run needs little memory."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Self, overload
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from hrcreplay.records import Bools, Ints
+
+#: An array of any type.
+Anything = np.ndarray[tuple[int, ...], np.dtype[Any]]
+
+#: Memory of the columns of one file that are kept, as most are asked for more than once [bytes].
+_KEPT_BYTES = 16_000_000
+
+
+class StoredTable:
+    """Rows and columns of a parquet file. What it has of pandas' DataFrame means the same.
+
+    Asked for a column it returns a Series, for a list of columns a DataFrame, for a mask the rows that are True. Tables
+    made from it share its file; of that the columns that were asked for last are kept in memory, 16 MB of them.
+    """
+
+    def __init__(
+        self,
+        path: Path | _File,
+        columns: Sequence[str] | None = None,
+        rows: Bools | None = None,
+        made: Mapping[str, Anything] | None = None,
+    ) -> None:
+        """Names a table; of the file only its description is read.
+
+        Args:
+            path: The file.
+            columns: The columns; None: all of the file.
+            rows: (n,) True for the rows of the file that belong to the table; None: all.
+            made: Column beside those of the file, or in place of one -> (n,) its values in the rows of the table.
+        """
+        self._file = path if isinstance(path, _File) else _File(path)
+        self._rows, self._made = rows, dict(made or {})
+        self.columns = self._file.names if columns is None else tuple(columns)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.columns
+
+    def __len__(self) -> int:
+        return self._file.length if self._rows is None else int(np.count_nonzero(self._rows))
+
+    @property
+    def empty(self) -> bool:
+        """True for a table without rows."""
+        return not len(self)
+
+    @overload
+    def __getitem__(self, key: str) -> pd.Series[Any]: ...
+    @overload
+    def __getitem__(self, key: list[str]) -> pd.DataFrame: ...
+    @overload
+    def __getitem__(self, key: pd.Series[bool] | Bools) -> StoredTable: ...
+    def __getitem__(self, key: str | list[str] | pd.Series[bool] | Bools) -> Any:
+        """A column, some columns, or the table of some rows.
+
+        Raises:
+            KeyError: There is no such column.
+        """
+        if isinstance(key, str):
+            return self._read([key], self._rows)[key]
+        if isinstance(key, list):
+            return self._read(key, self._rows)
+        return self._where(np.asarray(key, dtype=np.bool_))
+
+    def _where(self, mask: Bools) -> StoredTable:
+        rows = mask
+        if self._rows is not None:
+            rows = np.zeros(len(self._rows), dtype=np.bool_)
+            rows[np.flatnonzero(self._rows)[mask]] = True
+        return StoredTable(self._file, self.columns, rows, {name: values[mask] for name, values in self._made.items()})
+
+    @property
+    def iloc(self) -> _Places:
+        """Rows by their places; reads the groups of rows that have them."""
+        return _Places(self)
+
+    def drop(self, *, columns: str) -> StoredTable:
+        """The table without a column."""
+        return StoredTable(self._file, [name for name in self.columns if name != columns], self._rows, self._made)
+
+    def reset_index(self, *, drop: bool) -> Self:  # noqa: ARG002 (that of DataFrame)
+        """The table itself: its rows are counted from 0."""
+        return self
+
+    def assign(self, **made: Any) -> StoredTable:
+        """The table with other values in some columns, or with more columns: values of each row, or one for all."""
+        values = {name: np.broadcast_to(np.asarray(value), len(self)) for name, value in made.items()}
+        columns = tuple(dict.fromkeys([*self.columns, *made]))
+        return StoredTable(self._file, columns, self._rows, self._made | values)
+
+    def at(self, places: Ints) -> pd.DataFrame:
+        """Some rows, by their places in ascending order, with all columns."""
+        rows = np.zeros(self._file.length, dtype=np.bool_)
+        rows[places if self._rows is None else np.flatnonzero(self._rows)[places]] = True
+        made = {name: values[places] for name, values in self._made.items()}
+        return StoredTable(self._file, self.columns, rows, made)._read(list(self.columns), rows)  # noqa: SLF001
+
+    def _read(self, names: list[str], rows: Bools | None) -> pd.DataFrame:
+        if absent := [name for name in names if name not in self.columns]:
+            raise KeyError(absent[0])
+        found = self._file.read([name for name in names if name not in self._made] or [self._file.names[0]], rows)
+        for name in names:
+            if name in self._made:
+                found[name] = self._made[name]
+        return found[names]
+
+
+class _File:
+    """A parquet file, and the columns that were read last."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._kept: OrderedDict[str, pd.Series[Any]] = OrderedDict()
+        self._about = pq.read_metadata(path)
+        self.names = tuple(self._about.schema.to_arrow_schema().names)
+        self.length = int(self._about.num_rows)
+        counts = [self._about.row_group(i).num_rows for i in range(self._about.num_row_groups)]
+        self._starts = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
+
+    def read(self, names: list[str], rows: Bools | None) -> pd.DataFrame:
+        """Some columns, of all rows or of those (n,) that are True."""
+        groups = [] if rows is None else [i for i, (a, b) in enumerate(pairwise(self._starts)) if rows[a:b].any()]
+        if rows is None or 2 * len(groups) > len(self._starts) - 1:
+            whole = {name: self._column(name) for name in names}
+            return pd.DataFrame(
+                {name: x if rows is None else x[rows].reset_index(drop=True) for name, x in whole.items()}
+            )
+        groups = groups or [0]
+        kept = np.concatenate([rows[self._starts[i] : self._starts[i + 1]] for i in groups])
+        with pq.ParquetFile(self._path, metadata=self._about) as file:
+            table = file.read_row_groups(groups, columns=names, use_threads=False)
+        return table.filter(pa.array(kept)).to_pandas(split_blocks=True, self_destruct=True)
+
+    def _column(self, name: str) -> pd.Series[Any]:
+        """A whole column, kept or read."""
+        found = self._kept.pop(name, None)
+        if found is None:
+            with pq.ParquetFile(self._path, metadata=self._about) as file:
+                found = file.read(columns=[name], use_threads=False).to_pandas()[name]
+        self._kept[name] = found
+        while len(self._kept) > 1 and sum(column.nbytes for column in self._kept.values()) > _KEPT_BYTES:
+            self._kept.popitem(last=False)
+        return found
+
+
+class _Places:
+    """Rows of a table by their places, as ``DataFrame.iloc``."""
+
+    def __init__(self, table: StoredTable) -> None:
+        self._table = table
+
+    @overload
+    def __getitem__(self, key: int | np.integer[Any]) -> pd.Series[Any]: ...
+    @overload
+    def __getitem__(self, key: slice | Ints) -> pd.DataFrame: ...
+    def __getitem__(self, key: int | np.integer[Any] | slice | Ints) -> Any:
+        places = np.arange(len(self._table))[key]
+        if isinstance(key, slice) or np.ndim(key):
+            return self._table.at(np.asarray(places))
+        return self._table.at(np.array([places])).iloc[0]
+
+
+#: A table of a run: in its folder, or in memory.
+RunTable = pd.DataFrame | StoredTable

@@ -1,0 +1,110 @@
+"""A table read from its file column by column, beside the same table in pandas."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from hrcreplay.store import stored_table
+from hrcreplay.store.stored_table import RunTable, StoredTable
+
+N, GROUP = 1000, 64
+
+
+@pytest.fixture
+def tables(tmp_path: Path) -> tuple[StoredTable, pd.DataFrame]:
+    """The same table stored in groups of rows, and in memory."""
+    rng = np.random.default_rng(3)
+    frame = pd.DataFrame(
+        {
+            "t_ns": np.arange(N, dtype=np.int64) * 4_000_000,
+            "person": np.arange(N, dtype=np.int64) % 3 + 1,
+            "distance_m": np.where(rng.random(N) < 0.1, np.nan, rng.normal(size=N)),
+            "limb": np.array(["HD", "THX", None])[rng.integers(0, 3, N)],
+            "moving": rng.random(N) < 0.5,
+        }
+    )
+    path = tmp_path / "table.parquet"
+    pq.write_table(pa.Table.from_pandas(frame, preserve_index=False), path, row_group_size=GROUP)
+    return StoredTable(path), pq.read_table(path).to_pandas()
+
+
+def same(stored: RunTable, frame: pd.DataFrame) -> None:
+    """All columns, names, types and values."""
+    assert list(stored.columns) == list(frame.columns)
+    assert len(stored) == len(frame)
+    assert stored.empty == frame.empty
+    pd.testing.assert_frame_equal(stored[list(frame.columns)], frame.reset_index(drop=True))
+    for name in frame:
+        pd.testing.assert_series_equal(stored[str(name)], frame[name].reset_index(drop=True))
+
+
+def test_it_is_the_table_that_was_stored(tables: tuple[StoredTable, pd.DataFrame]) -> None:
+    stored, frame = tables
+    same(stored, frame)
+    assert "limb" in stored
+    assert "link" not in stored
+    with pytest.raises(KeyError, match="link"):
+        stored["link"]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.002, 0.3, 1.0])
+def test_a_mask_of_a_mask_keeps_the_same_rows(tables: tuple[StoredTable, pd.DataFrame], share: float) -> None:
+    stored, frame = tables
+    mask = np.random.default_rng(4).random(N) < share
+    same(stored[mask], frame[mask])
+    inner = frame["moving"].to_numpy()[mask]
+    same(stored[mask][inner], frame[mask][inner])
+    assert stored[mask][inner].iloc[:3].equals(frame[mask][inner].iloc[:3].reset_index(drop=True))
+
+
+def test_a_mask_of_few_groups_reads_the_same_as_one_of_all(tables: tuple[StoredTable, pd.DataFrame]) -> None:
+    stored, frame = tables
+    for first, last in ((0, 10), (60, 70), (500, 640), (0, N), (N - 1, N)):
+        mask = (np.arange(N) >= first) & (np.arange(N) < last)
+        same(stored[mask], frame[mask])
+
+
+def test_rows_by_their_places(tables: tuple[StoredTable, pd.DataFrame]) -> None:
+    stored, frame = tables
+    mask = frame["person"].to_numpy() == 2
+    for table, whole in ((stored, frame), (stored[mask], frame[mask])):
+        for places in (slice(5, 9), slice(None, None, 100), slice(-3, None), np.array([0, 63, 64, 300])):
+            pd.testing.assert_frame_equal(table.iloc[places], whole.iloc[places].reset_index(drop=True))
+        for place in (0, 64, -1):
+            assert table.iloc[place].to_dict() == pytest.approx(whole.iloc[place].to_dict(), nan_ok=True)
+    with pytest.raises(IndexError):
+        stored.iloc[N]
+
+
+def test_columns_left_out_and_columns_made(tables: tuple[StoredTable, pd.DataFrame]) -> None:
+    stored, frame = tables
+    same(stored.drop(columns="person").reset_index(drop=True), frame.drop(columns="person"))
+    named = np.array([f"row {i}" for i in range(N)], dtype=object)
+    made, whole = stored.assign(limb=named.tolist()), frame.assign(limb=named)
+    mask = frame["moving"].to_numpy()
+    assert made["limb"].tolist() == named.tolist()
+    assert made[mask]["limb"].tolist() == whole[mask]["limb"].tolist()
+    assert made[["limb", "t_ns"]].iloc[7].to_dict() == whole[["limb", "t_ns"]].iloc[7].to_dict()
+    assert made.iloc[3:5]["limb"].tolist() == ["row 3", "row 4"]
+    assert made[mask].iloc[2]["limb"] == whole[mask].iloc[2]["limb"]
+    new: dict[str, Any] = {"tcp_speed": 0.25, "overlap_m": np.linspace(0.0, 1.0, N)}
+    same(stored.assign(**new), frame.assign(**new))
+    same(stored[mask].assign(distance_m=0.5), frame[mask].assign(distance_m=0.5))
+
+
+def test_it_keeps_no_more_of_a_file_than_it_may(
+    tables: tuple[StoredTable, pd.DataFrame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stored, frame = tables
+    monkeypatch.setattr(stored_table, "_KEPT_BYTES", 2 * 8 * N)
+    for name in [*frame.columns, *frame.columns[::-1]]:
+        pd.testing.assert_series_equal(stored[name], frame[name])
+        assert sum(column.nbytes for column in stored._file._kept.values()) <= 2 * 8 * N or len(stored._file._kept) == 1
+    assert list(stored._file._kept) == ["person", "t_ns"]
