@@ -351,24 +351,26 @@ def tcp_speed_limit(grid: Grid, s_s: float) -> float:
 @njit(cache=True)
 def place(grid: Grid, s_s: float) -> tuple[Floats, Floats, Floats]:
     """Position, velocity and acceleration (nv,) each, ``s_s`` seconds of programmed time after a path's start."""
+    q, dq, ddq = np.empty((3, grid.q.shape[1]))
+    write_place(grid, s_s, q, dq, ddq)
+    return q, dq, ddq
+
+
+@njit(cache=True, inner=True)
+def write_place(grid: Grid, s_s: float, q: Floats, dq: Floats, ddq: Floats) -> None:
+    """Writes what ``place`` returns: the cubic through the grid points around ``s_s``, and its two derivatives."""
     if not 0.0 <= s_s < grid.duration_s:
-        row = 0 if s_s < 0.0 else grid.end
-        return grid.q[row].copy(), np.zeros(grid.q.shape[1]), np.zeros(grid.q.shape[1])
+        q[:], dq[:], ddq[:] = grid.q[0 if s_s < 0.0 else grid.end], 0.0, 0.0
+        return
     at = s_s % ((len(grid.q) - 1) * STEP_S) / STEP_S
     i = min(int(at), len(grid.q) - 2)
-    return _cubic(grid.q[i], grid.q[i + 1], grid.dq[i], grid.dq[i + 1], at - i, STEP_S)
-
-
-@njit(cache=True)
-def _cubic(
-    q0: Floats, q1: Floats, dq0: Floats, dq1: Floats, share: float, step_s: float
-) -> tuple[Floats, Floats, Floats]:
-    """The cubic with the given end positions and end velocities, and its two derivatives."""
-    way, m0, m1 = q1 - q0, dq0 * step_s, dq1 * step_s
-    b, a = 3 * way - 2 * m0 - m1, m0 + m1 - 2 * way
-    q = q0 + share * (m0 + share * (b + share * a))
-    dq = (m0 + share * (2 * b + share * 3 * a)) / step_s
-    return q, dq, (2 * b + share * 6 * a) / step_s**2
+    share = at - i
+    for j in range(len(q)):
+        way, m0, m1 = grid.q[i + 1, j] - grid.q[i, j], grid.dq[i, j] * STEP_S, grid.dq[i + 1, j] * STEP_S
+        b, a = 3 * way - 2 * m0 - m1, m0 + m1 - 2 * way
+        q[j] = grid.q[i, j] + share * (m0 + share * (b + share * a))
+        dq[j] = (m0 + share * (2 * b + share * 3 * a)) / STEP_S
+        ddq[j] = (2 * b + share * 6 * a) / STEP_S**2
 
 
 class Waits(NamedTuple):

@@ -11,6 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hrcreplay.geometry.small_matrices import apply
+from hrcreplay.geometry.vectors import norm_n
+from hrcreplay.kernels import njit
 from hrcreplay.records import Bools, Floats
 from hrcreplay.robot.control.separation import Obstacles, Separation
 from hrcreplay.robot.kinematics import RobotPose
@@ -52,22 +55,33 @@ def pair_speeds(pairs: Separation, speeds: Floats, horizon_s: float) -> Floats:
     return np.asarray(np.where(np.isnan(speeds), np.inf, np.maximum(speeds, gap_m / horizon_s)))
 
 
+@njit(cache=True)
 def end_speeds(pose: RobotPose, dq: Floats) -> Floats:
     """(s,) speed of the faster end of each link's axis at joint velocities (nv,) [rad/s] [m/s]."""
-    return np.asarray(np.linalg.norm(pose.J_ends @ dq, axis=2).max(axis=1))
+    found = np.zeros(len(pose.J_ends))
+    for s in range(len(found)):
+        for end in range(2):
+            found[s] = max(found[s], norm_n(apply(pose.J_ends[s, end], dq)))
+    return found
 
 
+@njit(cache=True)
 def largest_rate(pose: RobotPose, towards: Floats, speeds: Floats) -> float:
     """Largest rate at which no end of a link is faster than its limit.
 
     Args:
         pose: The robot.
         towards: (nv,) velocity at rate 1 [rad/s].
-        speeds: (s,) largest speed of each link's ends [m/s].
+        speeds: (s,) largest speed of each link's ends; inf: not limited [m/s].
     """
+    rate = np.inf
+    if np.isinf(speeds).all():
+        return rate
     moving = end_speeds(pose, towards)
-    rates = np.divide(speeds, moving, out=np.full(len(speeds), np.inf), where=moving > SLOW)
-    return float(rates.min(initial=np.inf))
+    for s in range(len(speeds)):
+        if moving[s] > SLOW and not rate <= speeds[s] / moving[s]:  # a speed that is NaN allows none
+            rate = speeds[s] / moving[s]
+    return rate
 
 
 def select(obstacles: Obstacles, which: Bools) -> Obstacles:

@@ -22,7 +22,7 @@ from hrcreplay.robot.control.contact_speed import ContactSpeeds
 from hrcreplay.robot.control.separation import NearestLink, Obstacles, Separation, measure
 from hrcreplay.robot.kinematics import Arm, RobotPose, pose_at
 from hrcreplay.robot.model import RobotModel
-from hrcreplay.robot.task import Grid, Waits, place, waits
+from hrcreplay.robot.task import Grid, Waits, waits, write_place
 from hrcreplay.settings.sections import Plan
 
 
@@ -138,17 +138,25 @@ def stop_along_path(grid: Grid, s_s: float, rate: float, ddq_max: Floats, dt_s: 
     Returns:
         The stop; None if the robot cannot come to rest along the path.
     """
-    q, dq, along, ticks = _stop_along_path(grid, s_s, rate, ddq_max * dt_s, dt_s)
-    return Stop(q[: ticks + 1], dq[: ticks + 1], along[: ticks + 1]) if ticks < MOST_TICKS else None
+    q, dq, along, done = stop_rows(grid, s_s, rate, ddq_max * dt_s, dt_s)
+    return Stop(q, dq, along) if done else None
 
 
 @njit(cache=True)
-def _stop_along_path(
-    grid: Grid, s_s: float, rate: float, gain: Floats, dt_s: float
-) -> tuple[Floats, Floats, Floats, int]:
+def stop_rows(grid: Grid, s_s: float, rate: float, gain: Floats, dt_s: float) -> tuple[Floats, Floats, Floats, bool]:
+    """The rows of ``stop_along_path``, and whether they end at rest.
+
+    Args:
+        grid: The path.
+        s_s: Programmed time at the start of the stop [s].
+        rate: Share of the programmed speed at the start, in [0, 1].
+        gain: (nv,) largest change of velocity of an axis in a tick [rad/s].
+        dt_s: Length of a tick [s].
+    """
     nv = grid.q.shape[1]
     rows_q, rows_dq, along = np.empty((128, nv)), np.empty((128, nv)), np.empty((128, 2))
-    q, towards, _ = place(grid, s_s)
+    q, towards, bend = np.empty((3, nv))
+    write_place(grid, s_s, q, towards, bend)
     rows_q[0], rows_dq[0], along[0, 0], along[0, 1] = q, rate * towards, s_s, rate
     i = 0
     while i < MOST_TICKS and rows_dq[i].any():
@@ -158,7 +166,7 @@ def _stop_along_path(
         before, at = along[i, 1], along[i, 0]
         slower, tried = before, 0.0  # the path may bend so much that no lower rate keeps the limits
         for _ in range(_ROUNDS):
-            _, towards, _ = place(grid, at + 0.5 * dt_s * (before + tried))
+            write_place(grid, at + 0.5 * dt_s * (before + tried), q, towards, bend)
             least = _least_rate(towards, rows_dq[i], gain)
             if least <= tried + _SHARE:
                 slower = min(slower, tried)
@@ -166,10 +174,10 @@ def _stop_along_path(
                 break
             tried = least
         there = at + 0.5 * dt_s * (before + slower)
-        q, towards, _ = place(grid, there)
+        write_place(grid, there, q, towards, bend)
         i += 1
         rows_q[i], rows_dq[i], along[i, 0], along[i, 1] = q, slower * towards, there, slower
-    return rows_q, rows_dq, along, i
+    return rows_q[: i + 1], rows_dq[: i + 1], along[: i + 1], i < MOST_TICKS
 
 
 @njit(cache=True)
@@ -235,6 +243,16 @@ class QpRules(NamedTuple):
     dt_s: float
 
 
+class PathRules(NamedTuple):
+    """Settings of the methods that stay on the path as numbers for kernels; see ``settings.sections.Plan``."""
+
+    tcp_speed_max: float
+    tcp_acceleration_max: float
+    lead_s: float
+    square: bool  #: whether the right-hand side of Eq. (14) is as printed
+    dt_s: float
+
+
 @dataclass(frozen=True)
 class PlanSettings:
     """Settings of Section 5, without the robot."""
@@ -283,6 +301,14 @@ class PlanSettings:
             soft=plan.rows == "soft",
             dt_s=float(self.dt_s),
         )
+
+    @cached_property
+    def path_rules(self) -> PathRules:
+        """The settings of the methods that stay on the path as numbers."""
+        plan = self.plan
+        square = plan.constraint_rhs == "square"
+        limits = float(plan.tcp_speed_max), float(plan.tcp_acceleration_max), float(plan.lead_s)
+        return PathRules(*limits, square, float(self.dt_s))
 
     @cached_property
     def waits(self) -> Waits:

@@ -10,22 +10,30 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from hrcreplay.geometry.small_matrices import apply
 from hrcreplay.kernels import njit
-from hrcreplay.records import Floats
+from hrcreplay.records import Floats, Ints
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.contact_speed import largest_rate
-from hrcreplay.robot.control.control_step import PlanSettings, Proposal, Proposals, Sight, Stop, stop_along_path
+from hrcreplay.robot.control.control_step import PathRules, PlanSettings, Proposal, Proposals, Sight, Stop, stop_rows
 from hrcreplay.robot.control.qp_controller import cartesian_bounds
-from hrcreplay.robot.control.separation import Obstacles, rows_of_people, worst_rows
+from hrcreplay.robot.control.separation import (
+    Approach,
+    Obstacles,
+    PlaneRows,
+    Separation,
+    constraint_rhs,
+    no_obstacles,
+    tick_rows,
+    worst_rows,
+)
 from hrcreplay.robot.kinematics import RobotPose
 from hrcreplay.robot.model import RobotModel
-from hrcreplay.robot.task import Reference, place
+from hrcreplay.robot.task import Grid, Reference, place
 
 #: Rates that differ by no more than this are equal.
 SAME = 1e-7
@@ -35,14 +43,6 @@ HELD = 1e-11
 
 #: Largest number of iterations in the search for a rate.
 ROUNDS = 40
-
-
-@dataclass(frozen=True, slots=True)
-class PathState:
-    """Progress of the robot along its programmed path, and its share of the programmed speed."""
-
-    s_s: float  #: programmed time [s]
-    rate: float  #: in [0, 1]
 
 
 def propose(
@@ -74,14 +74,17 @@ def propose(
     Returns:
         The step and the stop after it, along the path; or the reason why there is none.
     """
-    state, slowest = PathState(*current_stop.along[0].tolist()), current_stop.rest().along[0, 1]
-    fastest, slowed = _fastest(robot, reference, state, sight, obstacles, horizon_s, settings, link_speeds)
-    if fastest is None or fastest.rate < slowest - SAME:
+    rows, pairs = (obstacles, sight.pairs) if obstacles is not None else (_NOBODY, _NO_PAIRS)
+    if pairs is None:
+        return sight.reason or control_step.NO_DISTANCE
+    speeds = np.full(len(robot.segments), np.inf) if link_speeds is None else link_speeds
+    around = Around(rows.vertices_m, rows.offsets, rows.boxes_m, pairs, speeds)
+    at, rules = current_stop.along[0], settings.path_rules
+    limits, slowest = (robot.dq_max, robot.ddq_max), float(current_stop.rest().along[0, 1])
+    found, slowed, q, dq, along = _propose(reference.grid, at, slowest, sight.pose, limits, around, horizon_s, rules)
+    if not found:
         return control_step.NO_SOLUTION
-    stop = stop_along_path(reference.grid, fastest.s_s, fastest.rate, robot.ddq_max, settings.dt_s)
-    if stop is None:
-        return control_step.NO_SOLUTION
-    return [Proposal(stop, control_step.LIMITED if slowed else control_step.TRACKING)]
+    return [Proposal(Stop(q, dq, along), control_step.LIMITED if slowed else control_step.TRACKING)]
 
 
 def protective_distance_m(pose: RobotPose, stop: Stop, human_speed: float, latency_s: float, dt_s: float) -> float:
@@ -103,80 +106,129 @@ def protective_distance_m(pose: RobotPose, stop: Stop, human_speed: float, laten
     return human_speed * (reaction_s + stop_s) + speed * reaction_s + 0.5 * speed * stop_s
 
 
-def _fastest(
-    robot: RobotModel,
-    reference: Reference,
-    state: PathState,
-    sight: Sight,
-    obstacles: Obstacles | None,
+class Around(NamedTuple):
+    """What bounds the rate beside the robot's own limits."""
+
+    vertices_m: Floats  #: (m, 3) of the volumes whose rows bound it [m]
+    offsets: Ints  #: (l + 1,) index of each volume's first vertex
+    boxes_m: Floats  #: (l, 2, 3) boxes around the volumes' vertices [m]
+    pairs: Separation  #: distances of all pairs of link and volume
+    link_speeds: Floats  #: (s,) largest speed of each link's ends; inf: not limited [m/s]
+
+
+#: No volumes. Arrays that are not written to, as those of people, so that numba compiles one version.
+_NOBODY = no_obstacles()
+_NO_PAIRS = Separation(np.empty((0, 0)), np.empty((0, 0)))
+
+
+@njit(cache=True)
+def _propose(
+    grid: Grid,
+    at: Floats,
+    slowest: float,
+    pose: RobotPose,
+    limits: tuple[Floats, Floats],
+    around: Around,
     horizon_s: float,
-    settings: PlanSettings,
-    link_speeds: Floats | None,
-) -> tuple[PathState | None, bool]:
-    """The largest rate that meets all constraints, and whether an approach row or a link's speed bounds it.
+    rules: PathRules,
+) -> tuple[bool, bool, Floats, Floats, Floats]:
+    """The stop after the step with the largest rate.
 
     Every bound is linear in the next velocity, which is the rate times the path's derivative at the next position.
+
+    Args:
+        grid: The path.
+        at: (2,) programmed time [s] and rate of the robot.
+        slowest: Rate of the stop that continues without a better step.
+        pose: The robot.
+        limits: (nv,) largest velocities and accelerations of the axes [rad/s, rad/s^2].
+        around: Further bounds.
+        horizon_s: Time from the tick on for which the volumes are valid [s].
+        rules: Settings.
+
+    Returns:
+        Whether there is such a step; whether an approach row or a link's speed bounds its rate; and the rows of
+        ``stop_rows``.
     """
-    dt_s, gain, pose, grid = settings.dt_s, robot.ddq_max * settings.dt_s, sight.pose, reference.grid
-    dq = state.rate * place(grid, state.s_s)[1]
-    low, high = np.maximum(-robot.dq_max, dq - gain), np.minimum(robot.dq_max, dq + gain)
-    J_low, J_high = cartesian_bounds(
-        pose.J_tcp, pose.dJdq_tcp, dq, settings.plan.tcp_speed_max, settings.plan.tcp_acceleration_max, dt_s
+    dq_max, gain, dt_s = limits[0], limits[1] * rules.dt_s, rules.dt_s
+    dq = at[1] * place(grid, at[0])[1]
+    axes = np.maximum(-dq_max, dq - gain), np.minimum(dq_max, dq + gain)
+    tcp = cartesian_bounds(pose.J_tcp, pose.dJdq_tcp, dq, rules.tcp_speed_max, rules.tcp_acceleration_max, dt_s)
+    rhs_m2 = constraint_rhs(around.pairs, rules.square, 0.0)
+    hulls, apart_m = (around.vertices_m, around.offsets, around.boxes_m), around.pairs.distance_m
+    rows = tick_rows(
+        pose, *hulls, rhs_m2, apart_m, horizon_s + rules.lead_s, PlaneRows(np.empty((0, len(dq))), gain[:0])
     )
-    slowed = False
-
-    def ahead(rate: float) -> float:
-        return state.s_s + 0.5 * dt_s * (state.rate + rate)
-
-    def most(rate: float) -> float:
-        nonlocal slowed
-        towards = place(grid, ahead(rate))[1]
-        free = min(1.0, rates(towards, low, high)[1], rates(apply(pose.J_tcp, towards), J_low, J_high)[1])
-        safe = free
-        if obstacles is not None and free >= 0.0:
-            safe = _safe_rate(sight, obstacles, towards, free, horizon_s + settings.plan.lead_s, settings)
-        if link_speeds is not None and free >= 0.0:
-            safe = min(safe, largest_rate(pose, towards, link_speeds))
-        slowed = safe < free
-        return safe
-
-    rate = _largest(1.0, most)
-    return (None, True) if rate is None else (PathState(ahead(rate), rate), slowed)
+    rate, slowed = _largest(grid, at, pose, axes, tcp, rows, around.link_speeds, dt_s)
+    if not rate >= slowest - SAME:
+        return False, slowed, np.empty((0, len(dq))), np.empty((0, len(dq))), np.empty((0, 2))
+    q, dq_stop, along, done = stop_rows(grid, at[0] + 0.5 * dt_s * (at[1] + rate), rate, gain, dt_s)
+    return done, slowed, q, dq_stop, along
 
 
-def _largest(top: float, bound: Callable[[float], float]) -> float | None:
-    """Largest x in [0, top] with ``x <= bound(x)``, for a bound that changes little with x; None without one."""
-    found, low, high, x = None, -1.0, top, top
+@njit(cache=True)
+def _largest(
+    grid: Grid,
+    at: Floats,
+    pose: RobotPose,
+    axes: tuple[Floats, Floats],
+    tcp: tuple[Floats, Floats],
+    rows: Approach,
+    link_speeds: Floats,
+    dt_s: float,
+) -> tuple[float, bool]:
+    """Largest rate in [0, 1] that its own bound allows; NaN without one. A bound changes little with the rate.
+
+    Args:
+        grid: The path.
+        at: (2,) programmed time [s] and rate of the robot.
+        pose: The robot.
+        axes: (nv,) bounds on the axes' velocities [rad/s].
+        tcp: (6,) bounds on the TCP's velocity [m/s, rad/s].
+        rows: Approach rows.
+        link_speeds: (s,) largest speed of each link's ends [m/s].
+        dt_s: Length of a tick [s].
+
+    Returns:
+        The rate, and whether the rows or a link's speed bound it.
+    """
+    found, low, high, rate, slowed = np.nan, -1.0, 1.0, 1.0, False
     for _ in range(ROUNDS):
-        most = bound(x)
-        if x <= most:
-            found = low = x
-            if x == top or most - x <= SAME * top:
+        _, towards, _ = place(grid, at[0] + 0.5 * dt_s * (at[1] + rate))
+        free = min(1.0, rates(towards, *axes)[1], rates(apply(pose.J_tcp, towards), *tcp)[1])
+        most = free
+        if free >= 0.0:
+            most, by_speed = _safe_rate(rows, towards, free), largest_rate(pose, towards, link_speeds)
+            if not by_speed >= most:
+                most = by_speed
+        slowed = most < free
+        if rate <= most:
+            found = low = rate
+            if rate == 1.0 or most - rate <= SAME:
                 break
         else:
-            high = x
-            if not x > 0.0:
+            high = rate
+            if not rate > 0.0:
                 break
-        guess = max(0.0, most)
-        x = guess if low < guess < high else max(0.0, 0.5 * (low + high))
-    return found
+        guess = most if most > 0.0 else 0.0
+        rate = guess if low < guess < high else max(0.0, 0.5 * (low + high))
+    return found, slowed
 
 
-def _safe_rate(
-    sight: Sight, obstacles: Obstacles, towards: Floats, rate: float, ahead_s: float, settings: PlanSettings
-) -> float:
-    """The largest rate, up to ``rate``, for which all approach rows hold, Eq. (16)."""
-    pairs = sight.pairs
-    if pairs is None:
-        return math.nan
-    rhs_m2 = pairs.constraint_rhs_m2(settings.plan.constraint_rhs)
-    rows = rows_of_people(sight.pose, obstacles, pairs, rhs_m2, ahead_s)
+@njit(cache=True, error_model="numpy")
+def _safe_rate(rows: Approach, towards: Floats, rate: float) -> float:
+    """The largest rate, up to ``rate``, for which all approach rows hold, Eq. (16); NaN if none is found."""
     for _ in range(ROUNDS):
         which, _, values = worst_rows(rows, rate * towards, HELD)
         if not len(which):
             return rate
-        rate *= float((rows.rhs_m2[which[:, 0], which[:, 1]] / values).min())
-    return math.nan
+        share = np.inf
+        for i in range(len(which)):
+            allowed = rows.rhs_m2[which[i, 0], which[i, 1]] / values[i]
+            if allowed < share or math.isnan(allowed):
+                share = allowed
+        rate *= share
+    return np.nan
 
 
 @njit(cache=True)

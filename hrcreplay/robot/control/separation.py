@@ -54,6 +54,14 @@ def obstacles(volumes: SweptVolumes, tick: int, horizon_s: float = math.inf) -> 
     return Obstacles(vertices, offsets, radius, around, known, horizon_s)
 
 
+def no_obstacles() -> Obstacles:
+    """No volumes, and it is known that there are none."""
+    vertices, radius = np.empty((0, 3)), np.empty(0)
+    for array in (vertices, radius):  # like those of people; otherwise numba compiles all kernels again
+        array.setflags(write=False)
+    return Obstacles(vertices, np.zeros(1, np.int64), radius, np.empty((0, 2, 3)), known=True)
+
+
 def join_obstacles(people: Sequence[Obstacles]) -> Obstacles:
     """The volumes of several people of one tick as those of one, person after person; one or more."""
     if len(people) == 1:

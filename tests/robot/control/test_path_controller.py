@@ -3,6 +3,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from hrcreplay.records import SweptVolumes
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.control_step import PlanSettings, Step, stop_along_path
 from hrcreplay.robot.control.controllers import ScalingController
-from hrcreplay.robot.control.path_controller import PathState, rates
+from hrcreplay.robot.control.path_controller import rates
 from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.path import plan_programme
@@ -26,6 +27,13 @@ from tests.robot.swinging import DT_S, PRINTED, STOP_S, base, robot
 __all__ = ["robot"]  # the fixture
 
 SETTINGS = PlanSettings(PRINTED, dt_s=DT_S, stop_s=STOP_S)
+
+
+class PathState(NamedTuple):
+    """Progress of the robot along its programmed path, and its share of the programmed speed."""
+
+    s_s: float
+    rate: float
 
 
 @pytest.fixture(scope="module")
