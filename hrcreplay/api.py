@@ -443,7 +443,7 @@ class Controller:
             self._started = planner, assembly.surroundings(self._run_config, robot)
         planner, around = self._started
         forecast = Forecast(around, person)
-        return planner.follow(forecast.t_ns, [forecast.predict(0)], around.names_of(int(person.numbers.max())))
+        return planner.follow(forecast.t_ns, forecast, around.names_of(int(person.numbers.max())))
 
     def to_pandas(self, steps: Sequence[Motion]) -> pd.DataFrame:
         """Returns the columns of motion.parquet for some of its steps."""

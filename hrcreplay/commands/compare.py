@@ -412,8 +412,7 @@ def plan(task: VariantTask, progress: Callable[[int], None] | None = None) -> tu
         if planner is not None:
             forecast = Forecast(surroundings, batch)
             t_ns, most = forecast.t_ns, max(most, int(batch.numbers.max()))
-            around = [forecast.predict(tick) for tick in range(len(t_ns))]
-            made = planner.follow(t_ns, around, surroundings.names_of(most))
+            made = planner.follow(t_ns, forecast, surroundings.names_of(most))
             writer.table(
                 f"motion_{slug}", motion_columns(made) | stages.nearest_columns(planner.robot, planner.static, made)
             )

@@ -37,7 +37,7 @@ from hrcreplay.robot.control.control_step import (
     stop_axis_by_axis,
     stop_straight,
 )
-from hrcreplay.robot.control.controllers import Controller, Predict, QpController
+from hrcreplay.robot.control.controllers import Controller, QpController
 from hrcreplay.store.columns import motion_columns, read_states
 from hrcreplay.store.run_folder import arrow_table
 from hrcreplay.store.stored_table import RunTable
@@ -96,13 +96,13 @@ class Record:
             return False
         motion = assembly.recorded_motion(self.run_config, self.programme.path.model, self.programme.recorded, None)
         t_ns = self.motion["t_ns"].to_numpy()[tick : tick + 1]
-        again = arrow_table(motion_columns(motion.follow(t_ns, [self.predict(tick)], self.names))).to_pylist()[0]
+        again = arrow_table(motion_columns(motion.follow(t_ns, self.forecast(tick), self.names))).to_pylist()[0]
         row = self.motion.iloc[tick]
         return all(row[name] == value or (pd.isna(row[name]) and pd.isna(value)) for name, value in again.items())
 
-    def predict(self, tick: int) -> Predict:
+    def forecast(self, tick: int) -> Forecast:
         """Predicts the obstacles at a tick."""
-        return Forecast(self.surroundings, self.people(tick)).predict(0)
+        return Forecast(self.surroundings, self.people(tick))
 
     def people(self, tick: int) -> HumanStates:
         """The fused people at a tick, one row each."""
@@ -136,7 +136,9 @@ class Record:
     def _context(self, tick: int) -> TickContext:
         controller = self.controller
         with np.errstate(all="ignore"):
-            return TickContext(controller.stop, controller.u, controller.s_s, controller.observe(self.predict(tick)))
+            return TickContext(
+                controller.stop, controller.u, controller.s_s, controller.observe(self.forecast(tick).predict(0))
+            )
 
     def _as_recorded(self, tick: int, step: control_step.Step) -> bool:
         """Returns True if a step equals the recorded one bit by bit."""

@@ -532,10 +532,10 @@ class MethodsFollowing:
         t_ns, sink, chosen = forecast.t_ns, self.sink, None
         self._most = max(self._most, int(forecast.states.numbers.max()))
         with sink.watch.stage("predict", len(t_ns)):
-            around = [forecast.predict(tick) for tick in range(len(t_ns))]
+            _ = forecast.person  # shared by the methods
         for name, planner in self.planners.items():
             with sink.watch.stage(f"plan {name}", len(t_ns)):
-                motion = planner.follow(t_ns, around, self.surroundings.names_of(self._most))
+                motion = planner.follow(t_ns, forecast, self.surroundings.names_of(self._most))
             columns = motion_columns(motion) | nearest_columns(planner.robot, planner.static, motion)
             sink.tables.table("motion" if planner.chosen else f"motion_{name}", columns)
             chosen = motion if planner.chosen else chosen

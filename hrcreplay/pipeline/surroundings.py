@@ -11,7 +11,7 @@ import numpy as np
 from hrcreplay.human.fusion.vacancy import WatchedArea
 from hrcreplay.human.model import LimitSet
 from hrcreplay.human.prediction import swept_volumes
-from hrcreplay.records import BORDER, HumanStates, SweptVolumes, volume_name
+from hrcreplay.records import BORDER, Floats, HumanStates, SweptVolumes, volume_name
 from hrcreplay.robot.control.border import Border
 from hrcreplay.robot.control.controllers import Predict
 from hrcreplay.robot.control.separation import Obstacles, join_obstacles, obstacles
@@ -139,6 +139,10 @@ class Surroundings:
         return replace(found, numbers=np.concatenate([limbs, rest]))
 
 
+#: Ticks whose volumes are computed together.
+_AHEAD = 32
+
+
 @dataclass
 class Forecast:
     """Obstacles of a batch of ticks, at any horizon."""
@@ -148,6 +152,8 @@ class Forecast:
 
     def __post_init__(self) -> None:
         self.t_ns, self._first = self.states.ticks()
+        self._last: tuple[int, float] | None = None  # tick and horizon asked for last
+        self._ahead: dict[float, tuple[int, SweptVolumes]] = {}  # horizon -> first row, volumes from it on
 
     @cached_property
     def person(self) -> swept_volumes.PreparedPerson:
@@ -165,13 +171,36 @@ class Forecast:
 
     def obstacles(self, tick: int, horizon_s: float) -> Obstacles:
         """Obstacles of one tick up to ``horizon_s`` [s]."""
-        rows = self.rows(tick)
-        if horizon_s == self.around.prediction.horizon_s:
-            people = [obstacles(self.full, row, horizon_s) for row in range(rows.start, rows.stop)]
-        else:
-            volumes = self.person.volumes(horizon_s, rows.start, rows.stop)
-            people = [obstacles(volumes, row, horizon_s) for row in range(len(volumes))]
+        rows, (first, volumes) = self.rows(tick), self._volumes(tick, horizon_s)
+        people = [obstacles(volumes, row - first, horizon_s) for row in range(rows.start, rows.stop)]
         return self.around.obstacles(self.states, rows, people)
+
+    def _volumes(self, tick: int, horizon_s: float) -> tuple[int, SweptVolumes]:
+        """Volumes of a tick, and their first row; those of the next ticks, too, if the tick before had this horizon.
+
+        So are the ticks of a robot that stands: to compute them together is faster, and other methods ask for them.
+        """
+        if horizon_s == self.around.prediction.horizon_s:
+            return 0, self.full
+        rows, before = self.rows(tick), self._last
+        self._last = tick, horizon_s
+        first, found = self._ahead.get(horizon_s, (0, None))
+        if found is None or not first <= rows.start <= rows.stop <= first + len(found):
+            ticks = _AHEAD if before == (tick - 1, horizon_s) else 1
+            first, end = rows.start, self.rows(min(tick + ticks, len(self.t_ns)) - 1).stop
+            found = self.person.volumes(horizon_s, first, end)
+            if ticks > 1:
+                self._ahead[horizon_s] = first, found
+        return first, found
+
+    def until(self, horizon_s: Floats) -> list[Obstacles]:
+        """Obstacles of every tick, each until its own horizon (n,) after it [s]."""
+        volumes, found = self.person.volumes(np.repeat(horizon_s, np.diff(self._first))), []
+        for tick, until_s in enumerate(horizon_s.tolist()):
+            rows = self.rows(tick)
+            people = [obstacles(volumes, row, until_s) for row in range(rows.start, rows.stop)]
+            found.append(self.around.obstacles(self.states, rows, people))
+        return found
 
     def predict(self, tick: int) -> Predict:
         """Obstacles of one tick as a function of the horizon."""

@@ -46,7 +46,7 @@ def count_by_points(states: HumanStates) -> Bools:
 
 
 def around_points(
-    volumes: SweptVolumes, states: HumanStates, prediction: Prediction, limbs_m: Floats, horizon_s: float
+    volumes: SweptVolumes, states: HumanStates, prediction: Prediction, limbs_m: Floats, horizon_s: Floats
 ) -> SweptVolumes:
     """Puts volumes around the points of the bodies that count by them; the other rows stay as they are.
 
@@ -55,7 +55,7 @@ def around_points(
         states: The fused people.
         prediction: Length of a hand, and latency.
         limbs_m: (6,) radii of LIMBS [m].
-        horizon_s: Time after each tick until which the volumes hold [s].
+        horizon_s: (n,) time after its tick until which each row holds [s].
     """
     rows = count_by_points(states)
     each = len(volumes.limbs)
@@ -64,7 +64,7 @@ def around_points(
     thick_m = np.append(limbs_m, THIGH_M)
     for i in np.flatnonzero(rows).tolist():
         shown = states.points_m[i]
-        span_s = float(states.frame_age_s[i]) + horizon_s + prediction.latency_s
+        span_s = float(states.frame_age_s[i]) + float(horizon_s[i]) + prediction.latency_s
         for k, limb in enumerate(volumes.limbs):
             parts[i * each + k] = _points_of(limb, shown)
             hand_m = prediction.hand_m if limb in ("LRA", "LLA") else 0.0
@@ -113,7 +113,7 @@ _CONTAINED = _ROWS | {
 
 
 def bound_by_seen(
-    volumes: SweptVolumes, states: HumanStates, radii_m: Floats, rows: Ints, prediction: Prediction, horizon_s: float
+    volumes: SweptVolumes, states: HumanStates, radii_m: Floats, rows: Ints, prediction: Prediction, horizon_s: Floats
 ) -> SweptVolumes:
     """Cuts volumes of people whose torso is out of sight to what the points shown of them allow.
 
@@ -123,7 +123,7 @@ def bound_by_seen(
         radii_m: (n, limbs) radii of volumes from the joints [m].
         rows: Rows of such people.
         prediction: Length of a hand, and latency.
-        horizon_s: Time after each tick until which the volumes hold [s].
+        horizon_s: (n,) time after its tick until which each row holds [s].
     """
     each, parts = len(volumes.limbs), np.split(volumes.vertices_m, volumes.offsets[1:-1])
     of_cameras, radius_m = states.camera_points_m, volumes.radius_m.copy()
@@ -133,7 +133,7 @@ def bound_by_seen(
         cameras, seen = np.nonzero(np.isfinite(of_cameras[i]).all(axis=2))
         if not len(seen):
             continue
-        span_s = min(float(states.frame_age_s[i]), SHOWN_S) + horizon_s + prediction.latency_s
+        span_s = min(float(states.frame_age_s[i]), SHOWN_S) + float(horizon_s[i]) + prediction.latency_s
         apart_m = _along_bones(states.lengths_m[i] + _LENGTHS_OFF * states.lengths_std_m[i])[:, seen]
         for k, limb in enumerate(volumes.limbs):
             own = i * each + k

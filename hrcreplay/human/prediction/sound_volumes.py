@@ -209,7 +209,7 @@ def _beside_m(limb: int, points: Floats, modelled: Floats) -> float:
 
 @njit(cache=True)
 def sweep_sound(
-    rows: SoundRows, first: int, last: int, span_s: float, rules: SoundRules, work: Surface
+    rows: SoundRows, first: int, last: int, span_s: Floats, rules: SoundRules, work: Surface
 ) -> tuple[Floats, Ints, Floats]:
     """Computes the swept volumes of all limbs for the rows ``first`` to ``last`` - 1.
 
@@ -217,14 +217,14 @@ def sweep_sound(
         rows: The person.
         first: First row.
         last: Row after the last one.
-        span_s: Horizon and latency [s].
+        span_s: (n,) horizon and latency of each row [s].
         rules: Settings and bounds.
         work: From ``surface``.
 
     Returns:
         Vertices (m, 3) [m] and the offsets of ``SweptVolumes``, and (n, limbs) radii [m].
     """
-    limbs, within = rows.radii.shape[1], SoundMotionLimits(rules.bounds, rules.coupled, span_s, rules.memory_s)
+    limbs = rows.radii.shape[1]
     radii = rows.radii[first:last].copy()
     offsets = np.zeros((last - first) * limbs + 1, np.int64)
     vertices = np.empty(((last - first) * limbs * 80 + 80, 3))
@@ -233,10 +233,11 @@ def sweep_sound(
     n = 0
     for i in range(first, last):
         if not rows.tubed.usable[i, :limbs].all():
+            within = SoundMotionLimits(rules.bounds, rules.coupled, span_s[i - first], rules.memory_s)
             enclose_row(i, rows.at, within, low, high, corners)
         for limb in range(limbs):
             if rows.tubed.usable[i, limb]:
-                count, radii[i - first, limb] = _tube(i, limb, rows, span_s, rules, short)
+                count, radii[i - first, limb] = _tube(i, limb, rows, span_s[i - first], rules, short)
                 vertices = append(vertices, n, short, count)
             else:
                 if limb == LEGS:

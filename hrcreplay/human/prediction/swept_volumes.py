@@ -293,23 +293,24 @@ class PreparedPerson:
     states: HumanStates
     rows: SoundRows | None  #: None for the printed methods
 
-    def volumes(self, horizon_s: float, first: int = 0, last: int | None = None) -> SweptVolumes:
+    def volumes(self, horizon_s: float | Floats, first: int = 0, last: int | None = None) -> SweptVolumes:
         """Computes the swept volumes of the ticks ``first`` to ``last`` - 1; see ``predict``.
 
         Args:
-            horizon_s: Time after each tick until which they hold [s].
+            horizon_s: Time after each tick until which they hold, for all or (n,) for each [s].
             first: First tick.
             last: Tick after the last one; None: all.
         """
         last, prediction = len(self.states) if last is None else last, self.predictor.prediction
-        found = self._filtered(horizon_s, first, last)
+        until_s = np.full(last - first, horizon_s, dtype=np.float64)
+        found = self._filtered(until_s, first, last)
         if self.by_points[first:last].any():
             states = self.states.rows(slice(first, last))
-            found = around_points(found, states, prediction, self.predictor.limbs_m, horizon_s)
+            found = around_points(found, states, prediction, self.predictor.limbs_m, until_s)
         if self.rows is not None and self.partly_seen[first:last].any():
             rows = np.flatnonzero(self.partly_seen[first:last])
             states, radii_m = self.states.rows(slice(first, last)), self.rows.radii[first:last]
-            found = bound_by_seen(found, states, radii_m, rows, prediction, horizon_s)
+            found = bound_by_seen(found, states, radii_m, rows, prediction, until_s)
         return found
 
     @cached_property
@@ -325,7 +326,7 @@ class PreparedPerson:
         lost = self.states.unseen_s[:, THX] > SHOWN_S
         return np.asarray(lost & np.isfinite(self.states.p[:, 0]))
 
-    def _filtered(self, horizon_s: float, first: int, last: int) -> SweptVolumes:
+    def _filtered(self, horizon_s: Floats, first: int, last: int) -> SweptVolumes:
         """Volumes from the filtered states; unknown for bodies that have none."""
         t_ns, prediction = self.states.t_ns[first:last], self.predictor.prediction
         if self.rows is None:
@@ -334,14 +335,15 @@ class PreparedPerson:
         vertices, offsets, radii = sweep_sound(self.rows, first, last, span_s, rules, work)
         return SweptVolumes(t_ns, offsets, vertices, radii, limbs_of(prediction), prediction.method)
 
-    def _printed(self, states: HumanStates, horizon_s: float) -> SweptVolumes:
+    def _printed(self, states: HumanStates, horizon_s: Floats) -> SweptVolumes:
         limits, method = self.predictor.limits, self.predictor.prediction.method
         vertices, offsets = _predict_rows(
             np.ascontiguousarray(states.p),
             np.ascontiguousarray(states.v),
             find_never_measured(states),
             np.ascontiguousarray(states.lengths_m),
-            MotionLimits(bounds_of(limits), limits.coupled, horizon_s, code_of(method)),
+            horizon_s,
+            MotionLimits(bounds_of(limits), limits.coupled, 0.0, code_of(method)),
             self.predictor.work,
         )
         radii = np.tile(self.predictor.limbs_m, (len(states), 1))
@@ -350,7 +352,7 @@ class PreparedPerson:
 
 @njit(cache=True)
 def _predict_rows(
-    p: Floats, v: Floats, never: Bools, lengths: Floats, within: MotionLimits, work: Surface
+    p: Floats, v: Floats, never: Bools, lengths: Floats, horizon_s: Floats, within: MotionLimits, work: Surface
 ) -> tuple[Floats, Ints]:
     limbs = 6
     offsets = np.zeros(len(p) * limbs + 1, np.int64)
@@ -358,7 +360,8 @@ def _predict_rows(
     low, high = np.empty(DOF), np.empty(DOF)
     n = 0
     for i in range(len(p)):
-        reach_row(p[i], v[i], never[i], within, low, high)
+        until = MotionLimits(within.bounds, within.coupled, horizon_s[i], within.method)
+        reach_row(p[i], v[i], never[i], until, low, high)
         for limb in range(limbs):
             swept, count = _sweep_limb(limb, low, high, lengths[i], work)
             vertices = append(vertices, n, swept, count)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, TypedDict
 
 import numpy as np
 
@@ -349,6 +349,10 @@ class Step:
     certified: bool  #: whether the step, or the stop that it continues, is clear of volumes that are still valid
     stop: Stop  #: the stop that continues at the next tick if no better step is certified
 
+    def beside(self, sight: Sight) -> Step:
+        """The step beside the people of an observation."""
+        return replace(self, **nearest_of(sight))
+
 
 @dataclass(frozen=True, slots=True)
 class Sight:
@@ -472,6 +476,21 @@ def motion_row(
     )
 
 
+class NearestPair(TypedDict):
+    """What a step and its row say of the nearest pair."""
+
+    distance_m: float
+    overlap_m: float
+    limb: int
+    link: int
+
+
+def nearest_of(sight: Sight) -> NearestPair:
+    """The nearest pair of link and limb of an observation."""
+    overlap_m = math.nan if math.isnan(sight.distance_m) else sight.overlap_m
+    return {"distance_m": sight.distance_m, "overlap_m": overlap_m, "limb": sight.limb, "link": sight.link}
+
+
 def make_step(sight: Sight, current_stop: Stop, taken: Taken, horizon_s: float, dt_s: float) -> Step:
     """The record of a tick.
 
@@ -487,14 +506,11 @@ def make_step(sight: Sight, current_stop: Stop, taken: Taken, horizon_s: float, 
         pose=sight.pose,
         u=np.asarray((after.dq - current_stop.dq[0]) / dt_s),
         next=after,
-        distance_m=sight.distance_m,
-        overlap_m=math.nan if math.isnan(sight.distance_m) else sight.overlap_m,
-        limb=sight.limb,
-        link=sight.link,
         status=taken.status,
         reason=taken.reason,
         horizon_s=horizon_s,
         tau_s=current_stop.ticks * dt_s,
         certified=taken.certified,
         stop=taken.stop,
+        **nearest_of(sight),
     )

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from hrcreplay.records import Ints, Motion
+from hrcreplay.records import Floats, Ints, Motion
 from hrcreplay.robot.control import path_controller, qp_controller
 from hrcreplay.robot.control.certificate import NO_PLANES, decide
 from hrcreplay.robot.control.contact_speed import SLOW, end_speeds, pair_speeds, select
@@ -32,7 +32,7 @@ from hrcreplay.robot.control.control_step import (
     standstill_reason,
 )
 from hrcreplay.robot.control.qp_controller import QpContext
-from hrcreplay.robot.control.separation import Obstacles
+from hrcreplay.robot.control.separation import Obstacles, no_obstacles
 from hrcreplay.robot.control.static_obstacles import StaticObstacles
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.task import Reference, ReferencePoint, follow, place
@@ -49,6 +49,16 @@ class ControllerTick(NamedTuple):
 
 #: Horizon from the tick on [s] -> the swept volumes of the tick that are valid until then.
 Predict = Callable[[float], Obstacles]
+
+
+class Outlook(Protocol):
+    """The swept volumes of a batch of ticks."""
+
+    def predict(self, tick: int) -> Predict:
+        """Volumes of one tick."""
+
+    def until(self, horizon_s: Floats) -> list[Obstacles]:
+        """Volumes of every tick, each until its own horizon (n,) after it [s]."""
 
 
 class Observation(NamedTuple):
@@ -109,6 +119,10 @@ class Controller(ABC):
         return Observation(
             observe(self.robot, self.state, obstacles, self.settings.plan.clearance_m), obstacles, horizon_s, predict
         )
+
+    def follow(self, outlook: Outlook, ticks: int) -> list[ControllerTick]:
+        """A batch of ticks."""
+        return [self.step(outlook.predict(tick)) for tick in range(ticks)]
 
     @abstractmethod
     def propose(self, seen: Observation) -> Proposals:
@@ -179,6 +193,15 @@ class BlindController(PathController):
 
     careful = False
 
+    def follow(self, outlook: Outlook, ticks: int) -> list[ControllerTick]:
+        """A batch of ticks: the motion first, as it ignores people, then the people of all ticks at once."""
+        moved = [self.step(_nobody) for _ in range(ticks)]
+        people = outlook.until(np.array([tick.step.horizon_s for tick in moved]))
+        return [
+            tick._replace(step=tick.step.beside(observe(self.robot, tick.state, there, self.settings.plan.clearance_m)))
+            for tick, there in zip(moved, people, strict=True)
+        ]
+
 
 class SsmController(PathController):
     """Speed and separation monitoring, ISO/TS 15066: moves while the protective separation distance is kept."""
@@ -245,6 +268,10 @@ class PflController(PathController):
         return [{"kind": "contact", "link": link, "volume": self.beside[volume], "speed_m_per_s": limits[link, volume]}]
 
 
+def _nobody(_horizon_s: float) -> Obstacles:
+    return no_obstacles()
+
+
 #: Method -> its controller.
 CONTROLLERS: dict[str, type[Controller]] = {
     "qp": QpController,
@@ -278,10 +305,10 @@ class Planner:
         """The time between two ticks [s]."""
         return self.controller.settings.dt_s
 
-    def follow(self, t_ns: Ints, around: Sequence[Predict], limbs: tuple[str, ...]) -> Motion:
+    def follow(self, t_ns: Ints, outlook: Outlook, limbs: tuple[str, ...]) -> Motion:
         """The motion of a batch of ticks with the predicted volumes of each; ``limbs`` names all possible volumes."""
         robot = self.controller.robot
-        ticks = [self.controller.step(predict) for predict in around]
+        ticks = self.controller.follow(outlook, len(t_ns))
         rows = [
             motion_row(tick.state, tick.step, tick.point.T_world_tcp[:3, 3], tick.point.tcp_speed, tick.programme_s)
             for tick in ticks

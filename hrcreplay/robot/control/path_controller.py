@@ -78,10 +78,10 @@ def propose(
     if pairs is None:
         return sight.reason or control_step.NO_DISTANCE
     speeds = np.full(len(robot.segments), np.inf) if link_speeds is None else link_speeds
-    around = Around(rows.vertices_m, rows.offsets, rows.boxes_m, pairs, speeds)
+    bounds = RateBounds(rows.vertices_m, rows.offsets, rows.boxes_m, pairs, speeds)
     at, rules = current_stop.along[0], settings.path_rules
     limits, slowest = (robot.dq_max, robot.ddq_max), float(current_stop.rest().along[0, 1])
-    found, slowed, q, dq, along = _propose(reference.grid, at, slowest, sight.pose, limits, around, horizon_s, rules)
+    found, slowed, q, dq, along = _propose(reference.grid, at, slowest, sight.pose, limits, bounds, horizon_s, rules)
     if not found:
         return control_step.NO_SOLUTION
     return [Proposal(Stop(q, dq, along), control_step.LIMITED if slowed else control_step.TRACKING)]
@@ -106,7 +106,7 @@ def protective_distance_m(pose: RobotPose, stop: Stop, human_speed: float, laten
     return human_speed * (reaction_s + stop_s) + speed * reaction_s + 0.5 * speed * stop_s
 
 
-class Around(NamedTuple):
+class RateBounds(NamedTuple):
     """What bounds the rate beside the robot's own limits."""
 
     vertices_m: Floats  #: (m, 3) of the volumes whose rows bound it [m]
@@ -128,7 +128,7 @@ def _propose(
     slowest: float,
     pose: RobotPose,
     limits: tuple[Floats, Floats],
-    around: Around,
+    bounds: RateBounds,
     horizon_s: float,
     rules: PathRules,
 ) -> tuple[bool, bool, Floats, Floats, Floats]:
@@ -142,7 +142,7 @@ def _propose(
         slowest: Rate of the stop that continues without a better step.
         pose: The robot.
         limits: (nv,) largest velocities and accelerations of the axes [rad/s, rad/s^2].
-        around: Further bounds.
+        bounds: Further bounds.
         horizon_s: Time from the tick on for which the volumes are valid [s].
         rules: Settings.
 
@@ -154,12 +154,12 @@ def _propose(
     dq = at[1] * place(grid, at[0])[1]
     axes = np.maximum(-dq_max, dq - gain), np.minimum(dq_max, dq + gain)
     tcp = cartesian_bounds(pose.J_tcp, pose.dJdq_tcp, dq, rules.tcp_speed_max, rules.tcp_acceleration_max, dt_s)
-    rhs_m2 = constraint_rhs(around.pairs, rules.square, 0.0)
-    hulls, apart_m = (around.vertices_m, around.offsets, around.boxes_m), around.pairs.distance_m
+    rhs_m2 = constraint_rhs(bounds.pairs, rules.square, 0.0)
+    hulls, apart_m = (bounds.vertices_m, bounds.offsets, bounds.boxes_m), bounds.pairs.distance_m
     rows = tick_rows(
         pose, *hulls, rhs_m2, apart_m, horizon_s + rules.lead_s, PlaneRows(np.empty((0, len(dq))), gain[:0])
     )
-    rate, slowed = _largest(grid, at, pose, axes, tcp, rows, around.link_speeds, dt_s)
+    rate, slowed = _largest(grid, at, pose, axes, tcp, rows, bounds.link_speeds, dt_s)
     if not rate >= slowest - SAME:
         return False, slowed, np.empty((0, len(dq))), np.empty((0, len(dq))), np.empty((0, 2))
     q, dq_stop, along, done = stop_rows(grid, at[0] + 0.5 * dt_s * (at[1] + rate), rate, gain, dt_s)

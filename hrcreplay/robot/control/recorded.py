@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from hrcreplay.records import Floats, Ints, Motion, MotionRow
-from hrcreplay.robot.control.control_step import REASONS, PlanSettings, RobotState, observe, stop_straight
-from hrcreplay.robot.control.controllers import Predict
+from hrcreplay.records import Ints, Motion, MotionRow
+from hrcreplay.robot.control.control_step import (
+    REASONS,
+    PlanSettings,
+    RobotState,
+    Stop,
+    nearest_of,
+    observe,
+    stop_straight,
+)
+from hrcreplay.robot.control.controllers import Outlook
+from hrcreplay.robot.control.separation import Obstacles
 from hrcreplay.robot.control.static_obstacles import StaticObstacles
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.recorded import UNKNOWN, RecordedCapsules, RecordedJoints
@@ -26,7 +34,7 @@ class RecordedMotion:
     static: StaticObstacles | None = None  #: objects of the cell and pairs of links, for the record
     chosen: bool = False  #: it is never the run's method
 
-    def follow(self, t_ns: Ints, around: Sequence[Predict], limbs: tuple[str, ...]) -> Motion:
+    def follow(self, t_ns: Ints, outlook: Outlook, limbs: tuple[str, ...]) -> Motion:
         """The recorded motion at a batch of ticks.
 
         The distance is that from the volumes until the robot could have stopped: from the velocity of the tick, with
@@ -34,33 +42,37 @@ class RecordedMotion:
 
         Args:
             t_ns: (n,) ticks [ns].
-            around: Volumes of each tick for any horizon.
+            outlook: Volumes of the ticks for any horizon.
             limbs: Names of all possible volumes.
         """
         sample = self.joints.sample(t_ns)
+        reasons, dt_s = sample.reason.tolist(), self.settings.dt_s
+        stops = [
+            None if reason else stop_straight(q, dq, self.robot.ddq_max, dt_s)
+            for q, dq, reason in zip(sample.q, sample.dq, reasons, strict=True)
+        ]
+        horizons_s = [0.0 if stop is None else self.settings.horizon_s(stop) for stop in stops]
         rows = [
-            _without_numbers(self.robot.nv, UNKNOWN[reason]) if reason else self._row(q, dq, predict)
-            for q, dq, reason, predict in zip(sample.q, sample.dq, sample.reason.tolist(), around, strict=True)
+            _without_numbers(self.robot.nv, UNKNOWN[reason]) if stop is None else self._row(stop, horizon_s, people)
+            for stop, reason, horizon_s, people in zip(
+                stops, reasons, horizons_s, outlook.until(np.array(horizons_s)), strict=True
+            )
         ]
         links = tuple(segment.name for segment in self.robot.segments)
         return Motion.of_rows(t_ns, rows, limbs=limbs, links=links, reasons=(*REASONS, *UNKNOWN[1:]))
 
-    def _row(self, q: Floats, dq: Floats, predict: Predict) -> MotionRow:
-        """The row of a tick with known joints."""
-        stop = stop_straight(q, dq, self.robot.ddq_max, self.settings.dt_s)
-        horizon_s = self.settings.horizon_s(stop)
-        sight = observe(self.robot, RobotState(q, dq), predict(horizon_s), self.settings.plan.clearance_m)
+    def _row(self, stop: Stop, horizon_s: float, people: Obstacles) -> MotionRow:
+        """The row of a tick with known joints: those at which its stop begins."""
+        q, dq = stop.q[0], stop.dq[0]
+        sight = observe(self.robot, RobotState(q, dq), people, self.settings.plan.clearance_m)
         return _without_numbers(self.robot.nv, REASONS[sight.reason])._replace(
             q=q,
             dq=dq,
             tcp_m=sight.pose.T_world_tcp[:3, 3],
             tcp_speed=sight.pose.tcp_speed,
-            distance_m=sight.distance_m,
-            overlap_m=math.nan if math.isnan(sight.distance_m) else sight.overlap_m,
-            limb=sight.limb,
-            link=sight.link,
             horizon_s=horizon_s,
             tau_s=stop.ticks * self.settings.dt_s,
+            **nearest_of(sight),
         )
 
 
@@ -77,12 +89,12 @@ class RecordedCapsuleMotion:
     static: None = None  #: it is not measured against objects
     chosen: bool = False  #: it is never the run's method
 
-    def follow(self, t_ns: Ints, _around: Sequence[Predict], limbs: tuple[str, ...]) -> Motion:
+    def follow(self, t_ns: Ints, _outlook: Outlook, limbs: tuple[str, ...]) -> Motion:
         """The recorded motion at a batch of ticks; without joints there are no stops, so no distance from volumes.
 
         Args:
             t_ns: (n,) ticks [ns].
-            _around: Not used.
+            _outlook: Not used.
             limbs: Names of all possible volumes.
         """
         sample = self.capsules.sample(t_ns)

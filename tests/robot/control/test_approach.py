@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 from hrcreplay.records import Floats
 from hrcreplay.robot.model import RobotModel, irb140
 from hrcreplay.robot.path import approach
-from hrcreplay.robot.task import STEP_S, _cubic
+from hrcreplay.robot.task import Grid, place
 
 
 @pytest.fixture(scope="module")
@@ -17,13 +17,11 @@ def robot() -> RobotModel:
 
 
 @njit
-def _sampled(grid: Floats, grid_dq: Floats, t: Floats, step_s: float) -> tuple[Floats, Floats]:
+def _sampled(grid: Grid, t: Floats) -> tuple[Floats, Floats]:
     """What ``Reference.sample`` says of position and acceleration at all times at once, (n, nv) each."""
-    q, ddq = np.empty((len(t), grid.shape[1])), np.empty((len(t), grid.shape[1]))
+    q, ddq = np.empty((len(t), grid.q.shape[1])), np.empty((len(t), grid.q.shape[1]))
     for k in range(len(t)):
-        at = t[k] / step_s
-        i = min(int(at), len(grid) - 2)
-        q[k], _, ddq[k] = _cubic(grid[i], grid[i + 1], grid_dq[i], grid_dq[i + 1], at - i, step_s)
+        q[k], _, ddq[k] = place(grid, t[k])
     return q, ddq
 
 
@@ -36,7 +34,7 @@ def test_an_approach_begins_and_ends_at_rest_and_keeps_its_share_of_the_limits(r
         assert_allclose(path.sample(0.0).q, start, atol=1e-12)
         assert_allclose(path.sample(path.duration_s).q, goal, atol=1e-12)
         t = np.arange(0.0, path.duration_s, 0.001)
-        q, ddq = _sampled(path.q, path.dq, t, STEP_S)
+        q, ddq = _sampled(path.grid, t)
         for k in rng.integers(len(t), size=100).tolist():
             found = path.sample(t[k])
             np.testing.assert_array_equal([found.q, found.ddq], [q[k], ddq[k]])
