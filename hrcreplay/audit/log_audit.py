@@ -202,8 +202,8 @@ def _audit_person(
     """
     prediction_stage = assembly.prediction_stage(run_config)
     horizon_s = standstill_s(prediction_stage)
-    fusion = run_config.settings.fusion
-    rows = select_rows(recording.states, int(recording.t_ns[-1]), fusion.rate_hz, horizon_s, fusion.fresh_s)
+    fusion, end_ns = run_config.settings.fusion, int(max(recording.states.t_ns[-1], recording.t_ns[-1]))
+    rows = select_rows(recording.states, end_ns, fusion.rate_hz, horizon_s, fusion.fresh_s)
     if not len(rows):
         raise LogError(f"{run_config.log}: nobody was seen for longer than the horizon of {horizon_s:g} s")
     future = recorded_future(recording.t_ns, recording.points_m, recording.states.rows(rows), horizon_s)

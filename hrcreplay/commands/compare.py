@@ -23,7 +23,7 @@ from hrcreplay.commands import replay
 from hrcreplay.commands.notes import notes_of
 from hrcreplay.errors import SettingsError
 from hrcreplay.evaluation.contact import (
-    Coverage,
+    Coverages,
     Predicted,
     compute_full_coverage,
     compute_own_coverage,
@@ -87,7 +87,7 @@ class VariantTask:
     variant: Variant
     folder: Path  #: contains state.parquet; motion and contact are written here
     people: RecordedPeople
-    full: Coverage | None  #: coverage by its volumes until the braking time; depends only on the occupancy
+    full: Coverages | None  #: coverage by its volumes until the braking time; depends only on the occupancy
     programme: PlacedProgramme
     ready: bool  #: True: the motion exists already
     size: int  #: ticks of a batch
@@ -262,9 +262,9 @@ def _contacts(folder: Path, logs: Sequence[comparison.LogResult]) -> str:
 
 def _full_coverages(
     run_config: RunConfig, variants: Sequence[Variant], people: RecordedPeople, folder: Path
-) -> dict[str, Coverage]:
+) -> dict[str, Coverages]:
     """Computes the coverage of each person by the volumes of each occupancy until the braking time."""
-    found: dict[str, Coverage] = {}
+    found: dict[str, Coverages] = {}
     for variant in sorted(variants, key=lambda variant: variant.method in UNGUARDED):
         if variant.occupancy not in found:
             mine = variant_run_config(run_config, variant)

@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 
-from hrcreplay.evaluation.containment import Outcome, coverage
-from hrcreplay.evaluation.recorded_person import BodyTrack, RecordedPeople, read_people
+from hrcreplay.evaluation.containment import Coverage, Outcome
+from hrcreplay.evaluation.recorded_person import BodyTrack, RecordedPeople, SmoothedPeople, read_people
 from hrcreplay.evaluation.severity import severity_table
 from hrcreplay.geometry.distances import nearest_pair, protrusion_m
 from hrcreplay.human.model import LEG_PARTS, PARTS, part_radii
@@ -31,12 +31,32 @@ from hrcreplay.pipeline.people_smoother import PeopleSmoother
 from hrcreplay.pipeline.person_fuser import PersonFuser
 from hrcreplay.pipeline.run_config import RunConfig
 from hrcreplay.pipeline.surroundings import PredictionStage
-from hrcreplay.records import ALLOWING_CONTACT, BODY, RECORDED, UNGUARDED, Bools, Floats, HumanStates, Ints, SweptVolume
+from hrcreplay.records import (
+    ALLOWING_CONTACT,
+    BODY,
+    JOINTS,
+    LENGTHS,
+    RECORDED,
+    UNGUARDED,
+    Bools,
+    Floats,
+    HumanStates,
+    Ints,
+    SweptVolume,
+)
 from hrcreplay.robot.model import LinkMotion, RobotModel
 from hrcreplay.robot.recorded import CapsuleSample, RecordedCapsules
-from hrcreplay.store.columns import Columns, body_columns, contact_columns, person_columns, read_states, state_columns
+from hrcreplay.store.columns import (
+    Columns,
+    body_columns,
+    contact_columns,
+    person_columns,
+    read_states,
+    read_states_at,
+    state_columns,
+)
 from hrcreplay.store.run_folder import RunWriter, arrow_table
-from hrcreplay.store.stored_table import RunTable
+from hrcreplay.store.stored_table import RunTable, StoredTable
 
 _BATCH = 4096
 
@@ -65,20 +85,27 @@ def read_recorded_people(
         writer: Run folder with complete tables.
         seen: The bodies that stage 1 saw; None: the log is read again for them.
     """
-    parts = read_states(writer.partial / "state.parquet", _BATCH)
-    ticks_ns = np.concatenate([states.ticks()[0] for states in parts])
+    ticks_ns = np.unique(StoredTable(writer.partial / "state.parquet")["t_ns"].to_numpy())
     fusion_stage = assembly.fusion_stage(run_config, log)
     path = writer.partial / "smooth.parquet"
 
-    def smoothed() -> HumanStates:
+    def smoothed() -> SmoothedPeople:
         if not path.exists():
             for part in _smooth(run_config, log, ticks_ns):
                 writer.table("smooth", state_columns(part))
             writer.close_tables()
-        parts = read_states(path, _BATCH)
-        return HumanStates.join([replace(part, camera_points_m=None) for part in parts])  # half of the memory
+        return _read_smoothed(path)
 
     return read_people(log, ticks_ns, fusion_stage, smoothed, seen)
+
+
+def _read_smoothed(path: Path) -> SmoothedPeople:
+    """Reads what is needed of smooth.parquet."""
+    table = StoredTable(path)
+    p, lengths_m = (np.ascontiguousarray(table[list(names)].to_numpy(dtype=float)) for names in (JOINTS, LENGTHS))
+    used = table[[name for name in table.columns if name.startswith("valid_")]].to_numpy(dtype=bool)
+    person = table["person"].to_numpy() if "person" in table else None
+    return SmoothedPeople(table["t_ns"].to_numpy(), p, lengths_m, np.asarray(used.any(axis=1)), person)
 
 
 def _smooth(run_config: RunConfig, log: Log, ticks_ns: Ints) -> Iterator[HumanStates]:
@@ -159,12 +186,12 @@ class _JudgedRun:
         """Volumes of any tick."""
         return Predicted(assembly.prediction_stage(self.run_config), self.folder / "state.parquet")
 
-    def full(self) -> Coverage:
+    def full(self) -> Coverages:
         """Coverage by the volumes until the braking time."""
         return compute_full_coverage(self.run_config, self.people, self.predicted)
 
     def tables(
-        self, path: Path, capsules: RecordedCapsules | None = None, full: Callable[[], Coverage] | None = None
+        self, path: Path, capsules: RecordedCapsules | None = None, full: Callable[[], Coverages] | None = None
     ) -> tuple[Columns, Columns]:
         """Computes the rows of contact and of severity of a motion.
 
@@ -192,7 +219,7 @@ def _take_there(judged: _JudgedRun) -> None:
     _THERE[:] = [judged]
 
 
-def _full_there() -> Coverage:
+def _full_there() -> Coverages:
     return _THERE[0].full()
 
 
@@ -221,12 +248,12 @@ def body_axes(person: Sequence[BodyTrack], at_ns: Ints, hand_m: float) -> Floats
 
 
 #: Coverage of each person; None if not computed.
-Coverage = Sequence[Outcome | None]
+Coverages = Sequence[Outcome | None]
 
 
 def compute_own_coverage(
     run_config: RunConfig, people: RecordedPeople, predicted: Predicted, motion: RunTable
-) -> Coverage:
+) -> Coverages:
     """Coverage of every checked tick until the horizon of the volumes that the controller used.
 
     Args:
@@ -239,7 +266,7 @@ def compute_own_coverage(
     return _coverage(run_config, people, predicted, lambda states: _at(states.t_ns, *used))
 
 
-def compute_full_coverage(run_config: RunConfig, people: RecordedPeople, predicted: Predicted) -> Coverage:
+def compute_full_coverage(run_config: RunConfig, people: RecordedPeople, predicted: Predicted) -> Coverages:
     """Coverage of every checked tick until the braking time T_s, as ``audit`` counts it."""
     stop_s = predicted.stage.horizon_s
     return _coverage(run_config, people, predicted, lambda states: np.full(len(states), stop_s))
@@ -250,15 +277,17 @@ def _coverage(
     people: RecordedPeople,
     predicted: Predicted,
     horizons_s: Callable[[HumanStates], Floats],
-) -> Coverage:
+) -> Coverages:
     """Coverage of each person."""
     if run_config.settings.plan.method in UNGUARDED:
         return [None] * len(people.people)
-    found, fusion = [], run_config.settings.fusion
-    for person in people.people:
-        states = predicted.all_states.of_person(person.number)
-        found.append(coverage(predicted.stage, person, states, fusion, horizons_s(states)))
-    return found
+    fusion, end_ns = run_config.settings.fusion, predicted.last_ns
+    checks = {one.number: Coverage(predicted.stage, one, fusion, end_ns.get(one.number, 0)) for one in people.people}
+    for states in predicted.parts():
+        for number, check in checks.items():
+            own = states.of_person(number)
+            check.add(own, horizons_s(own))
+    return [check.outcome() for check in checks.values()]
 
 
 def contact_table(
@@ -268,8 +297,8 @@ def contact_table(
     motion: RunTable,
     people: RecordedPeople,
     predicted: Predicted,
-    own: Coverage | None,
-    full: Coverage | None,
+    own: Coverages | None,
+    full: Coverages | None,
     capsules: RecordedCapsules | None = None,
 ) -> Columns:
     """Computes the rows of contact.parquet for one motion.
@@ -300,7 +329,7 @@ def contact_table(
     outside_m = np.full(len(t_ns), np.nan)
     if method not in (*UNGUARDED, *ALLOWING_CONTACT):
         outside_m = by_volume(motion, person, people, radii_m, prediction.hand_m, predicted)
-    nobody: Coverage = [None] * len(each)
+    nobody: Coverages = [None] * len(each)
     pairs = zip(own or nobody, full or nobody, strict=True)
     of_each = [(_measure_left(a, t_ns), _measure_left(b, t_ns)) for a, b in pairs]
     columns = contact_columns(
@@ -471,19 +500,48 @@ class Predicted:
     stage: PredictionStage
     states: Path  #: state.parquet
 
-    @cached_property
-    def all_states(self) -> HumanStates:
-        """Reads the fused person at every tick."""
-        return HumanStates.join(list(read_states(self.states, _BATCH)))
+    def parts(self) -> Iterator[HumanStates]:
+        """Reads the fused people at every tick, part by part."""
+        return read_states(self.states, _BATCH)
 
-    def volumes(self, t_ns: int, horizon_s: float, person: int = 1) -> Volumes:
-        """Volumes of a person's last state that is not later than ``t_ns``; none if the person was unknown."""
-        states = self.all_states.of_person(person)
-        row = int(np.searchsorted(states.t_ns, t_ns, side="right")) - 1
-        if row < 0:
-            return {}
-        volumes = self.stage.volumes(states.rows(slice(row, row + 1)), horizon_s)
-        return {limb: volume for limb, volume in volumes.at(0).items() if volume.known}
+    @cached_property
+    def _ticks_ns(self) -> dict[int, Ints]:
+        """Number of a person -> the person's ticks."""
+        table = StoredTable(self.states)
+        t_ns = table["t_ns"].to_numpy()
+        if "person" not in table:
+            return {1: t_ns}
+        person = table["person"].to_numpy()
+        return {number: t_ns[person == number] for number in np.unique(person).tolist()}
+
+    @property
+    def last_ns(self) -> dict[int, int]:
+        """Number of a person -> the person's last tick [ns]."""
+        return {number: int(t_ns[-1]) for number, t_ns in self._ticks_ns.items()}
+
+    def volumes(self, asked: Sequence[tuple[int, float, int]]) -> list[Volumes]:
+        """Volumes of a person's last state that is not later than an instant; none if the person was unknown.
+
+        Args:
+            asked: Instant [ns], horizon [s] and number of the person for each.
+        """
+        ticks_ns = [self._last_tick(t_ns, person) for t_ns, _, person in asked]
+        if not any(known := [tick >= 0 for tick in ticks_ns]):
+            return [{} for _ in asked]
+        states = read_states_at(self.states, np.unique([tick for tick in ticks_ns if tick >= 0]))
+        people = {person: states.of_person(person) for _, _, person in asked}
+        found: list[Volumes] = []
+        for tick_ns, there, (_, horizon_s, person) in zip(ticks_ns, known, asked, strict=True):
+            row = int(np.searchsorted(people[person].t_ns, tick_ns))
+            volumes = self.stage.volumes(people[person].rows(slice(row, row + 1)), horizon_s).at(0) if there else {}
+            found.append({limb: volume for limb, volume in volumes.items() if volume.known})
+        return found
+
+    def _last_tick(self, t_ns: int, person: int) -> int:
+        """A person's last tick that is not later than ``t_ns``; -1 without one [ns]."""
+        ticks_ns = self._ticks_ns.get(person, np.zeros(0, np.int64))
+        row = int(np.searchsorted(ticks_ns, t_ns, side="right")) - 1
+        return -1 if row < 0 else int(ticks_ns[row])
 
 
 def by_volume(
@@ -510,16 +568,15 @@ def by_volume(
     outside_m, tracks, numbers = np.full(len(motion), np.nan), people.person, people.numbers
     t_ns, horizon_s = motion["t_ns"].to_numpy(), motion["horizon_s"].to_numpy(dtype=float)
     decided = deciding_rows(motion)
-    volumes: Volumes = {}
-    last = (-1, 0)
-    for i in np.flatnonzero(_is_turning(motion) & (found.distance_m <= 0.0)).tolist():
-        k, person = int(decided[i]), int(numbers[found.track[i]])
-        if k < 0:
-            continue
-        if (k, person) != last:
-            volumes, last = predicted.volumes(int(t_ns[k]), float(horizon_s[k]), person), (k, person)
+    touching = np.flatnonzero(_is_turning(motion) & (found.distance_m <= 0.0) & (decided >= 0)).tolist()
+    used = {i: (int(decided[i]), int(numbers[found.track[i]])) for i in touching}
+    each = sorted(set(used.values()))
+    volumes = dict(
+        zip(each, predicted.volumes([(int(t_ns[k]), float(horizon_s[k]), number) for k, number in each]), strict=True)
+    )
+    for i, key in used.items():
         part = int(found.part[i])
-        solid = volumes.get(VOLUME_OF[PARTS[part]])
+        solid = volumes[key].get(VOLUME_OF[PARTS[part]])
         if solid is not None:
             axes_m = tracks[int(found.track[i])].axes_m(t_ns[i : i + 1], hand_m)[:, part]
             outside_m[i] = protrusion_m(axes_m, float(radii_m[part]), *solid)[0]

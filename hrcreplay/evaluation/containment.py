@@ -95,35 +95,50 @@ class RecordedFuture:
         }
 
 
+@dataclass(frozen=True)
+class RecordedLimbs:
+    """The recorded points of a person's limbs."""
+
+    t_ns: Ints  #: (m,) instants, increasing
+    points_m: dict[str, Floats]  #: limb -> (m, k, 3), world [m]; NaN if not recorded or rejected
+    counts: dict[str, Ints]  #: limb -> (m + 1, k) number of rows before each in which a point was recorded
+
+    @classmethod
+    def of(cls, t_ns: Ints, points_m: Floats) -> RecordedLimbs:
+        """Selects the points of each limb.
+
+        Args:
+            t_ns: (m,) instants, increasing [ns].
+            points_m: (m, 20, 3) POINTS of the person, world [m]; NaN if not recorded or rejected.
+        """
+        points = points_m.copy()
+        # the model's neck is the middle of the shoulders, not the neck point of a camera
+        points[:, POINTS.index("neck")] = 0.5 * (points[:, _SHOULDERS[0]] + points[:, _SHOULDERS[1]])
+        limbs, counts = {}, {}
+        for limb, names in LIMB_POINTS.items():
+            limbs[limb] = np.ascontiguousarray(points[:, [POINTS.index(n) for n in names]])
+            counts[limb] = np.zeros((len(points) + 1, len(names)), np.int64)
+            np.cumsum(np.isfinite(limbs[limb]).all(axis=2), axis=0, out=counts[limb][1:])
+        return cls(t_ns, limbs, counts)
+
+    def future(self, states: HumanStates, horizon_s: float | Floats) -> RecordedFuture:
+        """Returns the recorded future (t, t + T] of some ticks.
+
+        Args:
+            states: (n,) the fused person at the ticks.
+            horizon_s: T, the prediction's horizon plus the latency, one per tick or one for all [s].
+        """
+        horizon_ns = np.round(np.asarray(horizon_s) * 1e9).astype(np.int64)
+        first = np.searchsorted(self.t_ns, states.t_ns, side="right")
+        last = np.searchsorted(self.t_ns, states.t_ns + horizon_ns, side="right")
+        end = np.searchsorted(self.t_ns, states.t_ns + np.round(_END * horizon_ns).astype(np.int64), side="right")
+        seen = {limb: np.asarray(count[last] > count[end]) for limb, count in self.counts.items()}
+        return RecordedFuture(states, self.points_m, first, last, seen)
+
+
 def recorded_future(t_ns: Ints, points_m: Floats, states: HumanStates, horizon_s: float | Floats) -> RecordedFuture:
-    """Returns the recorded future (t, t + T] of some ticks.
-
-    Args:
-        t_ns: (m,) instants of the recorded points, increasing [ns].
-        points_m: (m, 20, 3) POINTS of the person, world [m]; NaN if not recorded or rejected.
-        states: (n,) the fused person at the ticks.
-        horizon_s: T, the prediction's horizon plus the latency, one per tick or one for all [s].
-    """
-    points = points_m.copy()
-    # the model's neck is the middle of the shoulders, not the neck point of a camera
-    points[:, POINTS.index("neck")] = 0.5 * (points[:, _SHOULDERS[0]] + points[:, _SHOULDERS[1]])
-    limbs = {
-        limb: np.ascontiguousarray(points[:, [POINTS.index(n) for n in names]]) for limb, names in LIMB_POINTS.items()
-    }
-    horizon_ns = np.round(np.asarray(horizon_s) * 1e9).astype(np.int64)
-    first = np.searchsorted(t_ns, states.t_ns, side="right")
-    last = np.searchsorted(t_ns, states.t_ns + horizon_ns, side="right")
-    end = np.searchsorted(t_ns, states.t_ns + np.round(_END * horizon_ns).astype(np.int64), side="right")
-    return RecordedFuture(
-        states, limbs, first, last, {limb: _find_seen(part, end, last) for limb, part in limbs.items()}
-    )
-
-
-def _find_seen(recorded: Floats, first: Ints, last: Ints) -> Bools:
-    """(n, k) True if a point of (m, k, 3) was recorded in any row from ``first`` (n,) up to ``last`` (n,)."""
-    count = np.zeros((len(recorded) + 1, recorded.shape[1]), np.int64)
-    np.cumsum(np.isfinite(recorded).all(axis=2), axis=0, out=count[1:])
-    return np.asarray(count[last] > count[first])
+    """Returns the recorded future (t, t + T] of some ticks; see ``RecordedLimbs``."""
+    return RecordedLimbs.of(t_ns, points_m).future(states, horizon_s)
 
 
 def body_radii_m(prediction_stage: PredictionStage) -> dict[str, float]:
@@ -197,49 +212,62 @@ def _points(future: RecordedFuture, tick: int, limb: str) -> Floats:
     return future.limbs[limb][future.first[tick] : future.last[tick]].reshape(-1, 3)
 
 
-def select_rows(states: HumanStates, last_ns: int, rate_hz: float, horizon_s: float | Floats, fresh_s: float) -> Ints:
+def select_rows(
+    states: HumanStates, end_ns: int, rate_hz: float, horizon_s: float | Floats, fresh_s: float, first: int = 0
+) -> Ints:
     """Selects the rows of the states to check: evenly spaced, with a known person, a whole horizon before the end.
 
     Args:
-        states: (n,) every tick of a run.
-        last_ns: The last instant of the recording [ns].
+        states: (n,) ticks of a run, without a gap.
+        end_ns: The last tick of the run or, if later, the last instant of the recording [ns].
         rate_hz: Ticks a second of ``states`` [Hz].
         horizon_s: Horizon of all ticks or of each, with the latency [s].
         fresh_s: Maximum age of the newest frame of a known person [s].
+        first: Number of the run's ticks before these.
     """
     every = max(1.0, rate_hz / AUDIT_HZ)
-    number = np.arange(len(states))
+    number = np.arange(first, first + len(states))
     chosen = np.floor(number / every) != np.floor((number - 1) / every)
     chosen &= np.isfinite(states.p).all(axis=1) & (states.frame_age_s <= fresh_s)
-    left_ns = max(int(states.t_ns[-1]), last_ns) - states.t_ns
-    chosen &= np.round(np.asarray(horizon_s) * 1e9) <= left_ns
+    chosen &= np.round(np.asarray(horizon_s) * 1e9) <= end_ns - states.t_ns
     return np.flatnonzero(chosen)
 
 
-def coverage(
-    stage: PredictionStage, person: RecordedPerson, states: HumanStates, fusion: Fusion, horizon_s: Floats
-) -> Outcome | None:
-    """Computes the coverage of a recorded person by a run's volumes at the checked ticks; None without such ticks.
+class Coverage:
+    """Compares a recorded person with a run's volumes at the checked ticks, part by part of the run."""
 
-    Args:
-        stage: Stage 2.
-        person: The recorded person.
-        states: (n,) the person at every tick.
-        fusion: Settings of stage 1.
-        horizon_s: (n,) horizon of each tick's volumes, without the latency; NaN: tick not checked [s].
-    """
-    until_s = horizon_s + stage.settings.latency_s
-    last_ns = int(person.t_ns[-1]) if len(person.t_ns) else 0
-    rows = select_rows(states, last_ns, fusion.rate_hz, np.where(np.isfinite(until_s), until_s, np.inf), fusion.fresh_s)
-    asked = states.rows(rows)
-    future = recorded_future(person.t_ns, person.points_m, asked, until_s[rows])
-    radii_m, nothing = body_radii_m(stage), np.zeros(1, dtype=np.bool_)
-    if not len(rows):
-        return None
-    prepared, outcomes = stage.predictor.prepare(asked), []
-    for i, until in enumerate(horizon_s[rows].tolist()):
-        volumes = prepared.volumes(until, i, i + 1)
-        outcomes.append(
-            check_containment(volumes, future.rows(slice(i, i + 1)), radii_m, nothing, sizes=False, exact=False)
-        )
-    return Outcome.join(outcomes)
+    def __init__(self, stage: PredictionStage, person: RecordedPerson, fusion: Fusion, end_ns: int) -> None:
+        """Starts before the first tick.
+
+        Args:
+            stage: Stage 2.
+            person: The recorded person.
+            fusion: Settings of stage 1.
+            end_ns: The person's last tick [ns].
+        """
+        self._stage, self._fusion, self._ticks = stage, fusion, 0
+        self._limbs = RecordedLimbs.of(person.t_ns, person.points_m)
+        self._end_ns = max(end_ns, int(person.t_ns[-1]) if len(person.t_ns) else 0)
+        self._outcomes: list[Outcome] = []
+
+    def add(self, states: HumanStates, horizon_s: Floats) -> None:
+        """Checks the next ticks.
+
+        Args:
+            states: (n,) the person.
+            horizon_s: (n,) horizon of each tick's volumes, without the latency; NaN: tick not checked [s].
+        """
+        until_s, fusion = horizon_s + self._stage.settings.latency_s, self._fusion
+        whole_s = np.where(np.isfinite(until_s), until_s, np.inf)
+        rows = select_rows(states, self._end_ns, fusion.rate_hz, whole_s, fusion.fresh_s, self._ticks)
+        self._ticks += len(states)
+        if len(rows):
+            asked = states.rows(rows)
+            volumes = self._stage.predictor.prepare(asked).volumes(horizon_s[rows])
+            future, nobody = self._limbs.future(asked, until_s[rows]), np.zeros(len(rows), dtype=np.bool_)
+            radii_m = body_radii_m(self._stage)
+            self._outcomes.append(check_containment(volumes, future, radii_m, nobody, sizes=False, exact=False))
+
+    def outcome(self) -> Outcome | None:
+        """The outcome so far; None without a checked tick."""
+        return Outcome.join(self._outcomes) if self._outcomes else None

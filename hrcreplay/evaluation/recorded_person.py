@@ -29,6 +29,7 @@ from hrcreplay.records import (
     HumanStates,
     Ints,
     Measurements,
+    Table,
     find_neighbours,
 )
 
@@ -89,12 +90,52 @@ _HOLD_S = 0.02
 
 
 @dataclass(frozen=True)
+class SmoothedPeople(Table):
+    """Joints and lengths of the smoothed people: what is needed of their states here, an eighth of the memory."""
+
+    t_ns: Ints  #: (n,)
+    p: Floats  #: (n, 13) JOINTS [m, m, rad..., m]
+    lengths_m: Floats  #: (n, 7) LENGTHS [m]
+    used: Bools  #: (n,) whether the update of the tick used a camera
+    person: Ints | None = None  #: (n,) number of the person, from 1; None: person 1 in all rows
+
+    @classmethod
+    def of(cls, states: HumanStates) -> SmoothedPeople:
+        """Selects it from smoothed states."""
+        return cls(states.t_ns, states.p, states.lengths_m, np.asarray(states.valid.any(axis=1)), states.person)
+
+    def of_person(self, number: int) -> SmoothedPeople:
+        """The rows of one person, as if there were no other."""
+        return self if self.person is None else replace(self.rows(self.person == number), person=None)
+
+
+@dataclass(frozen=True)
+class ModelPoints:
+    """The model's points (n, 20, 3) of a person, computed for the rows that are asked for [m]; NaN where not known."""
+
+    p: Floats  #: (n, 13) JOINTS [m, m, rad..., m]
+    lengths_m: Floats  #: (n, 7) LENGTHS [m]
+    known: Bools  #: (n,)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Number of rows, points and coordinates."""
+        return len(self.p), len(POINTS), 3
+
+    def __getitem__(self, rows: slice | Ints) -> Floats:
+        """The points of some rows."""
+        points_m = skeleton(self.p[rows], self.lengths_m[rows])
+        points_m[~self.known[rows]] = np.nan
+        return points_m
+
+
+@dataclass(frozen=True)
 class BodyTrack:
     """Points of one body over time, from one source."""
 
     source: str  #: TRUTH, SMOOTHED, or a camera; for another body, the camera and the tracker's id
     t_ns: Ints  #: (n,) increasing
-    points_m: Floats  #: (n, 20, 3) POINTS, world [m]; NaN if unknown
+    points_m: Floats | ModelPoints  #: (n, 20, 3) POINTS, world [m]; NaN if unknown
     hold_s: float = 0.0  #: time around a sample for which a point counts if the neighbouring sample lacks it [s]
 
     def axes_m(self, at_ns: Ints, hand_m: float) -> Floats:
@@ -157,7 +198,7 @@ class RecordedPeople:
         return np.array([one.number for one in self.people for _ in one.tracks], dtype=np.int64)
 
 
-def at_instants(t_ns: Ints, points_m: Floats, at_ns: Ints, gap_s: float, hold_s: float = 0.0) -> Floats:
+def at_instants(t_ns: Ints, points_m: Floats | ModelPoints, at_ns: Ints, gap_s: float, hold_s: float = 0.0) -> Floats:
     """Interpolates body points at some instants: linear between two samples, or constant for a short time.
 
     Args:
@@ -173,8 +214,10 @@ def at_instants(t_ns: Ints, points_m: Floats, at_ns: Ints, gap_s: float, hold_s:
     if not len(t_ns):
         return np.full((len(at_ns), *points_m.shape[1:]), np.nan)
     before, after, share, known = find_neighbours(t_ns, at_ns, gap_s)
-    share = share[:, None, None]
-    found = np.where(share > 0.0, (1.0 - share) * points_m[before] + share * points_m[after], points_m[before])
+    found = points_m[before]
+    if (share > 0.0).any():
+        share = share[:, None, None]
+        found = np.where(share > 0.0, (1.0 - share) * found + share * points_m[after], found)
     found[~known] = np.nan
     if hold_s > 0.0:
         for side in (before, after):
@@ -183,21 +226,20 @@ def at_instants(t_ns: Ints, points_m: Floats, at_ns: Ints, gap_s: float, hold_s:
     return found
 
 
-def from_states(states: HumanStates, memory_s: float) -> BodyTrack:
+def from_states(states: SmoothedPeople, memory_s: float) -> BodyTrack:
     """Returns the smoothed person, without the times at which no camera saw the person.
 
     Args:
-        states: The smoothed states.
+        states: The smoothed person.
         memory_s: Maximum time between two ticks that used a camera; the person is unknown in a longer gap [s].
     """
-    points_m = skeleton(states.p, states.lengths_m)
-    points_m[~_find_seen(states, memory_s)] = np.nan
+    points_m = ModelPoints(states.p, states.lengths_m, _find_seen(states, memory_s))
     return BodyTrack(SMOOTHED, states.t_ns, points_m)
 
 
-def _find_seen(states: HumanStates, memory_s: float) -> Bools:
+def _find_seen(states: SmoothedPeople, memory_s: float) -> Bools:
     """(n,) True for ticks between two ticks with a camera at most ``memory_s`` [s] apart, both included."""
-    used = np.flatnonzero(states.valid.any(axis=1))
+    used = np.flatnonzero(states.used)
     if not len(used):
         return np.zeros(len(states), dtype=np.bool_)
     ticks = np.arange(len(states))
@@ -211,7 +253,7 @@ def read_people(
     log: Log,
     ticks_ns: Ints,
     fusion_stage: FusionStage,
-    smoothed_states: Callable[[], HumanStates],
+    smoothed_people: Callable[[], SmoothedPeople],
     bodies: SeenBodies | None = None,
 ) -> RecordedPeople:
     """Reads all people in a log within a span.
@@ -220,7 +262,7 @@ def read_people(
         log: Log to read.
         ticks_ns: (n,) ticks of the span, increasing [ns].
         fusion_stage: Cameras, and settings of stage 1.
-        smoothed_states: Returns the smoothed states of these ticks; called for people without ground truth.
+        smoothed_people: Returns the smoothed people at these ticks; called for people without ground truth.
         bodies: The bodies that stage 1 saw in the span; None: it is run again for them.
     """
     bodies = _see_bodies(log, ticks_ns, fusion_stage) if bodies is None else bodies
@@ -230,9 +272,9 @@ def read_people(
     of_truth = 1 if truth is None or seen is None else _nearest_to(truth, seen)
     people = []
     if truth is not None:
-        people.append(RecordedPerson(of_truth, TRUTH, truth.t_ns, truth.points_m, (truth,)))
+        people.append(RecordedPerson(of_truth, TRUTH, truth.t_ns, truth.points_m[:], (truth,)))
     rest = [number for number in _numbers(seen) if truth is None or number != of_truth]
-    best = smoothed_states() if rest else None
+    best = smoothed_people() if rest else None
     for number in rest:
         own = best.of_person(number) if best is not None else None
         mine = None if seen is None else seen.rows(seen.body == number)
@@ -286,12 +328,12 @@ def _nearest_to(truth: BodyTrack, seen: CameraFrames) -> int:
 
 
 def _recorded_person(
-    number: int, seen: CameraFrames | None, best: HumanStates, fusion_stage: FusionStage
+    number: int, seen: CameraFrames | None, best: SmoothedPeople, fusion_stage: FusionStage
 ) -> RecordedPerson:
     """A person without ground truth: the smoothed states and the believed points of each camera."""
     smoothed = from_states(best, fusion_stage.filter.memory_s)
     if seen is None or not len(seen):
-        return RecordedPerson(number, SMOOTHED, smoothed.t_ns, smoothed.points_m, (smoothed,))
+        return RecordedPerson(number, SMOOTHED, smoothed.t_ns, smoothed.points_m[:], (smoothed,))
     points, _ = _select_accepted(seen, best, fusion_stage)
     source, t_ns, points_m = _recorded_points(seen, points, best)
     cameras = [
@@ -402,16 +444,17 @@ def read_recordings(
         if truth is None:
             best += smoother.add(states, trace)
     fused, measurements = HumanStates.join(passed), Measurements.join(seen)
-    smoothed = fused if truth is not None else HumanStates.join([*best, *smoother.finish()])
+    best += smoother.finish() if truth is None else []
+    smoothed = SmoothedPeople.of(fused if truth is not None else HumanStates.join(best))
     of_truth = 0 if truth is None else _nearest_to(truth, as_frames(measurements))
     known = np.isfinite(fused.p[:, 0])
     found = {}
     for number in sorted(set(fused.numbers[known].tolist())) or [1]:
         states, own = fused.of_person(number), smoothed.of_person(number)
         if truth is not None and number == of_truth:
-            joints, _ = inverse_kinematics.inverse(truth.points_m)
+            joints, _ = inverse_kinematics.inverse(truth.points_m[:])
             whole = _plain(log, counts)
-            found[number] = Recording(states, truth.t_ns, truth.points_m, truth.t_ns, joints, TRUTH, whole)
+            found[number] = Recording(states, truth.t_ns, truth.points_m[:], truth.t_ns, joints, TRUTH, whole)
             continue
         mine = measurements.rows(measurements.numbers == number)
         points, rejected = _select_accepted(mine, own, fusion_stage)
@@ -421,7 +464,9 @@ def read_recordings(
     return found
 
 
-def _recorded_points(seen: Measurements | CameraFrames, points: Floats, best: HumanStates) -> tuple[str, Ints, Floats]:
+def _recorded_points(
+    seen: Measurements | CameraFrames, points: Floats, best: SmoothedPeople
+) -> tuple[str, Ints, Floats]:
     """Returns source, instants and points of the person: accepted camera points, else the smoothed person."""
     if not np.isfinite(points).any():
         return SMOOTHED, best.t_ns, skeleton(best.p, best.lengths_m)
@@ -464,7 +509,7 @@ def fuse_stretches(
 
 
 def _select_accepted(
-    seen: Measurements | CameraFrames, best: HumanStates, fusion_stage: FusionStage
+    seen: Measurements | CameraFrames, best: SmoothedPeople, fusion_stage: FusionStage
 ) -> tuple[Floats, Counter[str]]:
     """Returns the accepted measured points (m, 20, 3), and the number of other points per camera and reason.
 

@@ -15,6 +15,7 @@ from hrcreplay.audit import metrics as audit_metrics
 from hrcreplay.audit import recorded_motion
 from hrcreplay.commands import audit
 from hrcreplay.evaluation import recorded_person
+from hrcreplay.evaluation.recorded_person import SmoothedPeople
 from hrcreplay.limits import load_limits
 from hrcreplay.logs.writer import LogWriter
 from hrcreplay.pipeline.fusion_stage import FusionStage
@@ -60,7 +61,7 @@ def test_a_teleport_is_thrown_out_and_a_squat_is_not() -> None:
     p = np.zeros((4, DOF))
     p[:, [4, 8]], p[:, [7, 11]] = 0.2, 2.5
     best = replace(best, p=p, t_ns=frames(points).capture_ns)
-    believed, counts = recorded_person._select_accepted(_seen(points), best, _eyes())
+    believed, counts = recorded_person._select_accepted(_seen(points), SmoothedPeople.of(best), _eyes())
     gone: Bools = np.asarray(np.isfinite(points).all(axis=2) & np.isnan(believed).any(axis=2))
     assert [POINTS[k] for k in np.flatnonzero(gone[1])] == ["wrist_l"]
     assert [POINTS[k] for k in np.flatnonzero(gone[3])] == ["pelvis"]
@@ -107,7 +108,9 @@ def test_what_has_no_confidence_was_not_seen_and_does_not_jump() -> None:
     p = np.zeros((6, DOF))
     p[:, [4, 8]], p[:, [7, 11]] = 0.2, 2.5
     best = replace(best, p=p, t_ns=seen.capture_ns)
-    believed, counts = recorded_person._select_accepted(replace(_seen(points), confidence=confidence), best, _eyes())
+    believed, counts = recorded_person._select_accepted(
+        replace(_seen(points), confidence=confidence), SmoothedPeople.of(best), _eyes()
+    )
     assert np.isnan(believed[:, hand]).all()
     assert np.isfinite(believed[[0, 1, 2, 4], wrist]).all()
     missing = int(np.isnan(points).any(axis=2).sum())
@@ -129,7 +132,9 @@ def test_shoulders_that_were_not_seen_hold_no_pelvis() -> None:
     p = np.zeros((2, DOF))
     p[:, [4, 8]], p[:, [7, 11]] = 0.2, 2.5
     best = replace(best, p=p, t_ns=frames(points).capture_ns)
-    believed, _ = recorded_person._select_accepted(replace(_seen(points), confidence=confidence), best, _eyes())
+    believed, _ = recorded_person._select_accepted(
+        replace(_seen(points), confidence=confidence), SmoothedPeople.of(best), _eyes()
+    )
     assert np.isfinite(believed[:, POINTS.index("pelvis"), 0]).tolist() == [True, False]
 
 

@@ -13,7 +13,7 @@ import pytest
 from hrcreplay.commands import replay, report
 from hrcreplay.evaluation import contact
 from hrcreplay.evaluation.contact import VOLUME_OF, Volumes
-from hrcreplay.evaluation.recorded_person import BodyTrack, RecordedPeople, RecordedPerson, from_states
+from hrcreplay.evaluation.recorded_person import BodyTrack, RecordedPeople, RecordedPerson, SmoothedPeople, from_states
 from hrcreplay.human.model import PARTS
 from hrcreplay.logs import reader
 from hrcreplay.records import LIMBS, POINTS, Floats, HumanStates, SweptVolume
@@ -77,9 +77,9 @@ def test_a_bar_that_swings_past_a_forearm_touches_at_the_ticks_worked_out(robot:
     dq = np.full(81, 5.0)
     dq[60:] = 0.0
     body = standing_beside(around(0.0), 81)
-    body = dataclasses.replace(body, points_m=np.where(np.arange(81)[:, None, None] == 45, np.nan, body.points_m))
+    body = dataclasses.replace(body, points_m=np.where(np.arange(81)[:, None, None] == 45, np.nan, body.points_m[:]))
     found = near(robot, turning(robot, q, dq), body)
-    expected = [surface_distance(robot, q[i], body.points_m[i]) if i != 45 else np.nan for i in range(81)]
+    expected = [surface_distance(robot, q[i], body.points_m[:][i]) if i != 45 else np.nan for i in range(81)]
     np.testing.assert_allclose(found.distance_m, expected, atol=2e-3)
     touching = np.flatnonzero(np.array(expected) <= 0.0)
     assert len(touching) > 5
@@ -96,7 +96,7 @@ def test_the_speed_is_that_of_the_surface_that_touches(robot: RobotModel) -> Non
         ends = robot.ends_m(q[i : i + 1])[found.link[i]]
         radius_m = robot.segments[found.link[i]].radius_m
         shares = np.linspace(0.0, 1.0, 2001)[:, None]
-        a, b = (e[0] + shares * (e[1] - e[0]) for e in (ends, body.points_m[i, [ELBOW, WRIST]]))
+        a, b = (e[0] + shares * (e[1] - e[0]) for e in (ends, body.points_m[:][i, [ELBOW, WRIST]]))
         gaps = np.linalg.norm(a[:, None] - b[None, ::100], axis=2)
         row, column = np.unravel_index(np.argmin(gaps), gaps.shape)
         towards = b[100 * column] - a[row]
@@ -172,7 +172,7 @@ def test_a_contact_is_laid_at_the_door_of_robot_or_prediction(robot: RobotModel)
     found = near(robot, motion, body)
     touching = np.flatnonzero(found.distance_m <= 0.0)
     motion.loc[touching[2] - 3 : touching[-1], "status"] = "braking"  # what was decided before goes on
-    alone = RecordedPeople((RecordedPerson(1, body.source, body.t_ns, body.points_m, (body,)),), ())
+    alone = RecordedPeople((RecordedPerson(1, body.source, body.t_ns, body.points_m[:], (body,)),), ())
     for ball_m, sign in ((0.5, -1.0), (0.1, 1.0)):
         known = Known(at, ball_m)
         outside = contact.by_volume(motion, found, alone, RADII_M, 0.0, known)  # type: ignore[arg-type]
@@ -255,7 +255,7 @@ def test_where_no_camera_saw_anybody_the_smoothed_person_is_not_known(with_truth
     valid = np.zeros_like(states.valid)
     valid[[40, 100, 180], 0] = True  # 0.24 s and 0.32 s apart
     seen: HumanStates = dataclasses.replace(states, valid=valid)
-    known = np.isfinite(from_states(seen, 0.3).points_m[:, POINTS.index("wrist_r"), 0])
+    known = np.isfinite(from_states(SmoothedPeople.of(seen), 0.3).points_m[:][:, POINTS.index("wrist_r"), 0])
     expected = np.zeros(len(states), dtype=bool)
     expected[40:101] = True
     expected[180] = True

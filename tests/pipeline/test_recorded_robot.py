@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from hrcreplay.commands import compare, explain, replay, report
 from hrcreplay.errors import LogError, SettingsError
-from hrcreplay.evaluation.recorded_person import RecordedPeople, read_people
+from hrcreplay.evaluation.recorded_person import RecordedPeople, SmoothedPeople, read_people
 from hrcreplay.human.model import part_radii
 from hrcreplay.logs.reader import open_log
 from hrcreplay.logs.writer import LogWriter
@@ -178,7 +178,9 @@ def people_of(folder: Path, run_config: RunConfig) -> RecordedPeople:
     opened = open_log(run_config.log, run_config.settings.logs)
     states = HumanStates.join(list(read_states(folder / "state.parquet", 4096)))
     smooth = HumanStates.join(list(read_states(folder / "smooth.parquet", 4096)))
-    return read_people(opened, states.t_ns, assembly.fusion_stage(run_config, opened), lambda: smooth)
+    return read_people(
+        opened, states.t_ns, assembly.fusion_stage(run_config, opened), lambda: SmoothedPeople.of(smooth)
+    )
 
 
 def capsule(ends: Floats, radius_m: float) -> tuple[Any, Any]:
