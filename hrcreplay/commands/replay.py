@@ -34,7 +34,7 @@ from hrcreplay.records import RECORDED, HumanStates, Ints
 from hrcreplay.reporting import tables
 from hrcreplay.reporting.summary_text import defect_notes
 from hrcreplay.store import run_folder
-from hrcreplay.store.columns import read_states
+from hrcreplay.store.columns import read_states, state_columns
 from hrcreplay.store.run_folder import RunWriter, Stopwatch
 
 REPORTS = Path("reports")
@@ -222,13 +222,21 @@ def run_stages(
     """
     todo = [stage for stage in run_config.stages if stage not in reused]
     states: Iterable[HumanStates]
+    elsewhere: MethodsElsewhere | None = None
+
+    def store(people: HumanStates) -> None:
+        if elsewhere is None:
+            sink.tables.table("state", state_columns(people))
+        else:
+            elsewhere.store(people)
+
     if "fuse" in todo:
         stages.write_truth(log, int(ticks_ns[0]), int(ticks_ns[-1]), sink)
-        states = stages.fuse_batches(log, ticks_ns, size, assembly.fusion_stage(run_config, log), sink, smooth=smooth)
+        fusion_stage = assembly.fusion_stage(run_config, log)
+        states = stages.fuse_batches(log, ticks_ns, size, fusion_stage, sink, smooth=smooth, store=store)
     else:
         states = read_states(folder / "state.parquet", size)
     flow: Iterable[Any] = states
-    elsewhere: MethodsElsewhere | None = None
     if "plan" in todo:
         robot = assembly.robot(run_config, assembly.robot_base(run_config, log))
         programme = assembly.programme(run_config, log, robot)

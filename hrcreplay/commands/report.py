@@ -82,6 +82,7 @@ def write_report(
         radii["legs, of sound"] = prediction.legs_radius_m
     folder = writer.partial / "figures"
     kinds = catalogue.select_figures(run, found)
+    scene = scene_of(run_config, everybody)  # before the figures, of which the second process draws the rest meanwhile
     progress.begin("figures", len(kinds))
     _draw_figures(run_config, everybody, found, kinds, folder, progress=progress, second=second)
     progress.begin("page")
@@ -90,7 +91,6 @@ def write_report(
         tables.limit_table(run_config.tracking_limits, use="tracking"),
         tables.radius_table(radii),
     ]
-    scene = scene_of(run_config, everybody)
     writer.text(
         "report.html", report_page.render(run, found, folder, shown, stops=stops, scene=scene, people=everybody.people)
     )

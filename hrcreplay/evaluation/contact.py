@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 
 from hrcreplay.evaluation.containment import Coverage, Outcome
 from hrcreplay.evaluation.recorded_person import BodyTrack, RecordedPeople, SmoothedPeople, read_people
@@ -145,17 +144,18 @@ def write_contact(
         second.submit(_take_there, judged)
         full = second.submit(_full_there).result
         there = {path: second.submit(_tables_there, path) for path in paths[1:]}
-    for path in paths:
-        motion, capsules = pq.read_table(path).to_pandas(), None
+    found: dict[Path, tuple[Columns, Columns]] = {}
+    for path in [*paths[:1], *paths[:0:-1]]:  # the chosen motion, then the last ones until the second process is met
+        motion, capsules = StoredTable(path), None
         if path.stem == "motion":
             shown_ns = motion["t_ns"].to_numpy()[:: max(1, round(run_config.settings.fusion.rate_hz / _BODY_HZ))]
             writer.table("body", body_table(people, shown_ns, run_config.settings.prediction.hand_m))
         if path.stem == f"motion_{RECORDED}" and motion["q1"].isna().all():
             capsules, _ = assembly.recorded_capsules(log, T_world_base)
-        if path in there and capsules is None and not there[path].cancel():
-            rows, meetings = there[path].result()
-        else:
-            rows, meetings = judged.tables(path, capsules, full)
+        if path not in there or capsules is not None or there[path].cancel():
+            found[path] = judged.tables(path, capsules, full)
+    for path in paths:
+        rows, meetings = found.pop(path) if path in found else there.pop(path).result()
         writer.table("contact", rows)
         writer.table("severity", meetings)
     writer.close_tables()
@@ -202,7 +202,7 @@ class _JudgedRun:
         """
         run_config, people = self.run_config, self.people
         method = path.stem.removeprefix("motion").removeprefix("_") or run_config.settings.plan.method
-        motion, own, until = pq.read_table(path).to_pandas(), None, None
+        motion, own, until = StoredTable(path), None, None
         if path.stem == "motion":
             own = compute_own_coverage(run_config, people, self.predicted, motion)
             until = (full or self.full)()

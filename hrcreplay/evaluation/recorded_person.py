@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -137,6 +138,11 @@ class BodyTrack:
     t_ns: Ints  #: (n,) increasing
     points_m: Floats | ModelPoints  #: (n, 20, 3) POINTS, world [m]; NaN if unknown
     hold_s: float = 0.0  #: time around a sample for which a point counts if the neighbouring sample lacks it [s]
+
+    @cached_property
+    def period_ns(self) -> int:
+        """Median time between two samples; 0 for a single one [ns]."""
+        return int(np.median(np.diff(self.t_ns))) if len(self.t_ns) > 1 else 0
 
     def axes_m(self, at_ns: Ints, hand_m: float) -> Floats:
         """(m, 14, 2, 3) axes of the capsules of ``PARTS`` at some instants; with one known end, a ball [m]."""

@@ -18,6 +18,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 import pandas as pd
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from hrcreplay.evaluation.recorded_person import BodyTrack, RecordedPeople
 from hrcreplay.geometry.distances import nearest_pair
@@ -29,6 +30,7 @@ from hrcreplay.records import Bools, Floats, Ints
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.recorded import RecordedCapsules
 from hrcreplay.store.columns import Columns
+from hrcreplay.store.stored_table import RunTable
 
 #: Two stretches of contact with a shorter gap are one contact [s].
 MERGED_S = 0.2
@@ -81,7 +83,7 @@ def severity_table(
     run_config: RunConfig,
     robot: RobotModel,
     method: str,
-    motion: pd.DataFrame,
+    motion: RunTable,
     contact: pd.DataFrame,
     people: RecordedPeople,
     capsules: RecordedCapsules | None = None,
@@ -164,9 +166,7 @@ class Meeting:
     radii_m: Floats  #: (14,) of PARTS [m]
     hand_m: float  #: length of a hand beyond the wrist [m]
 
-    def impacts(
-        self, method: str, kind: str, motion: pd.DataFrame, contact: pd.DataFrame, ticks: Ints
-    ) -> Iterator[Impact]:
+    def impacts(self, method: str, kind: str, motion: RunTable, contact: pd.DataFrame, ticks: Ints) -> Iterator[Impact]:
         """Yields the contact at each of some ticks.
 
         Args:
@@ -180,11 +180,11 @@ class Meeting:
         names = [f"q{i + 1}" for i in range(self.robot.nv)]
         q, dq = (motion[[f"{d}{name}" for name in names]].to_numpy(dtype=float)[ticks] for d in ("", "d"))
         ends_m, velocity, radius_m, links = self._links(q, dq, t_ns)
-        source = contact["source"].to_numpy()[ticks]
+        source = contact["source"].to_numpy()[ticks].astype(str)
+        half_ns, around_m = self._around(t_ns, source)
         for i in range(len(ticks)):
-            track = self.tracks[self.sources.index(str(source[i]))]
-            axes_m = track.axes_m(t_ns[i : i + 1], self.hand_m)
-            pair = nearest_pair(ends_m[i : i + 1], radius_m[i], axes_m, self.radii_m)
+            axes_m = around_m[i, 1]
+            pair = nearest_pair(ends_m[i : i + 1], radius_m[i], axes_m[None], self.radii_m)
             link, part = int(pair.first[0]), int(pair.second[0])
             at_m, body_m = pair.at_first_m[0], pair.at_second_m[0]
             apart = body_m - at_m
@@ -192,9 +192,9 @@ class Meeting:
             normal = apart / length if length > 0.0 else np.full(3, np.nan)
             along = _share(ends_m[i, link], at_m)
             speed = (1.0 - along) * velocity[i, link, 0] + along * velocity[i, link, 1]
-            body_speed = self._velocity(track, int(t_ns[i]), part, _share(axes_m[0, part], body_m))
+            body_speed = _velocity(around_m[i, :, part], int(half_ns[i]), _share(axes_m[part], body_m))
             limb = PARTS[part]
-            in_hand = limb in _HAND and np.linalg.norm(axes_m[0, part, 1] - body_m) < self.hand_m
+            in_hand = limb in _HAND and np.linalg.norm(axes_m[part, 1] - body_m) < self.hand_m
             region = region_of(_HAND[limb] if in_hand else limb)
             robot_kg = np.nan
             if self.capsules is None:
@@ -227,17 +227,39 @@ class Meeting:
         names = tuple(segment.name for segment in segments)
         return motion.ends_m, motion.twist[:, :, None, :3] + turning, radius_m, names
 
-    def _velocity(self, track: BodyTrack, t_ns: int, part: int, along: float) -> Floats:
-        """(3,) velocity of the point of a part, mean from the sample before to the one after; NaN: unknown [m/s]."""
-        half = int(np.median(np.diff(track.t_ns))) if len(track.t_ns) > 1 else 0
-        at_ns = np.array([t_ns - half, t_ns, t_ns + half])
-        axes_m = track.axes_m(at_ns, self.hand_m)[:, part]
-        points_m = (1.0 - along) * axes_m[:, 0] + along * axes_m[:, 1]
-        known = np.flatnonzero(np.isfinite(points_m).all(axis=1))
-        if len(known) < 2 or not half:
-            return np.full(3, np.nan)
-        first, last = known[0], known[-1]
-        return np.asarray((points_m[last] - points_m[first]) / ((at_ns[last] - at_ns[first]) * 1e-9))
+    def _around(self, t_ns: Ints, source: NDArray[np.str_]) -> tuple[Ints, Floats]:
+        """Axes of the bodies one sample before some instants, at them, and one after.
+
+        Args:
+            t_ns: (k,) [ns].
+            source: (k,) name of the body's track at each.
+
+        Returns:
+            (k,) period of the track's samples [ns], and (k, 3, 14, 2, 3) [m].
+        """
+        period_ns, axes_m = np.empty(len(t_ns), np.int64), np.empty((len(t_ns), 3, len(PARTS), 2, 3))
+        for name in np.unique(source).tolist():
+            mine, track = source == name, self.tracks[self.sources.index(name)]
+            period_ns[mine] = track.period_ns
+            at_ns = t_ns[mine, None] + track.period_ns * np.arange(-1, 2)
+            axes_m[mine] = track.axes_m(at_ns.ravel(), self.hand_m).reshape(-1, *axes_m.shape[1:])
+        return period_ns, axes_m
+
+
+def _velocity(axes_m: Floats, step_ns: int, along: float) -> Floats:
+    """(3,) mean velocity of a point of a part, from the first known instant to the last one; NaN: unknown [m/s].
+
+    Args:
+        axes_m: (3, 2, 3) axis of the part at three instants [m].
+        step_ns: Time between them [ns].
+        along: Position of the point along the axis, 0 to 1.
+    """
+    points_m = (1.0 - along) * axes_m[:, 0] + along * axes_m[:, 1]
+    known = np.flatnonzero(np.isfinite(points_m).all(axis=1))
+    if len(known) < 2 or not step_ns:
+        return np.full(3, np.nan)
+    first, last = known[0], known[-1]
+    return np.asarray((points_m[last] - points_m[first]) / ((last - first) * step_ns * 1e-9))
 
 
 def _share(ends_m: Floats, point_m: Floats) -> float:

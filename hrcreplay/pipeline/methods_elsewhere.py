@@ -1,4 +1,4 @@
-"""The baselines of a run and the volumes that it stores, in the second process, beside the chosen method in the first.
+"""The baselines of a run and the tables of people and volumes, in the second process, beside the rest in the first.
 
 The first process sends each batch of fused people once its chosen method has used it.
 """
@@ -18,9 +18,10 @@ from hrcreplay.pipeline.run_config import RunConfig
 from hrcreplay.pipeline.stages import MethodsFollowing, Sink, store_stored_ticks
 from hrcreplay.pipeline.surroundings import Forecast
 from hrcreplay.records import Floats, HumanStates, Ints
+from hrcreplay.store.columns import state_columns
 from hrcreplay.store.run_folder import FolderTables, Stopwatch
 
-#: Number of batches that may wait for the second process: about 2.5 kB per tick.
+#: Number of batches that may wait for the second process, each twice: about 2.5 kB per tick.
 _MOST_WAITING = 100
 #: Stage -> ticks and duration [ns] of each call.
 Calls = dict[str, list[tuple[int, int]]]
@@ -46,7 +47,14 @@ class MethodsElsewhere:
 
     def take(self, batch: HumanStates, stored: Ints, horizon_s: Floats) -> None:
         """Sends a batch; waits if too many are under way, and raises what a batch before has raised."""
-        self._sent.append(self._second.submit(_take, batch, stored, horizon_s))
+        self._send(self._second.submit(_take, batch, stored, horizon_s))
+
+    def store(self, states: HumanStates) -> None:
+        """Sends fused people for their table."""
+        self._send(self._second.submit(_store, states))
+
+    def _send(self, sent: Future[None]) -> None:
+        self._sent.append(sent)
         while len(self._sent) > _MOST_WAITING:
             self._sent.popleft().result()
 
@@ -73,6 +81,9 @@ class _Work:
         self._methods.take(forecast)
         store_stored_ticks(forecast, stored, horizon_s, self._sink)
 
+    def store(self, states: HumanStates) -> None:
+        self._tables.table("state", state_columns(states))
+
     def finish(self) -> Calls:
         self._tables.close_tables()
         return {name: calls for name, calls in self._sink.watch.calls.items() if name != "predict"}
@@ -88,6 +99,10 @@ def _start(run_config: RunConfig, start_ns: int, names: Sequence[str], folder: P
 
 def _take(batch: HumanStates, stored: Ints, horizon_s: Floats) -> None:
     _UNDER_WAY[0].take(batch, stored, horizon_s)
+
+
+def _store(states: HumanStates) -> None:
+    _UNDER_WAY[0].store(states)
 
 
 def _finish() -> Calls:

@@ -171,7 +171,14 @@ def batches(frames: Iterator[CameraFrames], ticks_ns: Ints, size: int) -> Iterat
 
 
 def fuse_batches(
-    log: Log, ticks_ns: Ints, size: int, fusion_stage: FusionStage, sink: Sink, *, smooth: bool = False
+    log: Log,
+    ticks_ns: Ints,
+    size: int,
+    fusion_stage: FusionStage,
+    sink: Sink,
+    *,
+    smooth: bool = False,
+    store: Callable[[HumanStates], None] | None = None,
 ) -> Iterator[HumanStates]:
     """Stage 1: camera frames to the fused person; writes measurements and state and, if requested, ``smooth``.
 
@@ -182,10 +189,12 @@ def fuse_batches(
         fusion_stage: Cameras and settings of the stage.
         sink: Receives rows, counts and times.
         smooth: True: write the smoothed person at the end.
+        store: Writes the rows of state; None: to the tables of the sink.
 
     Raises:
         LogError: At the end: the log certainly shows no person, or no person was ever seen.
     """
+    store = store or (lambda states: sink.tables.table("state", state_columns(states)))
     fuser = PersonFuser(fusion_stage, log.header.cameras, traced=smooth)
     watched = fusion_stage.watched is not None
     frames = log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1, nobody=watched)
@@ -211,7 +220,7 @@ def fuse_batches(
         sink.counts.update(sightings.counts)
         sink.counts.update(events)
         ever = ever or bool(states.valid.any()) or max(fuser.area.vacant_ns) >= 0
-        sink.tables.table("state", state_columns(states))
+        store(states)
         sink.progress("fuse", len(ticks))
         yield states
     log.check()
