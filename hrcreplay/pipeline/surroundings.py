@@ -139,20 +139,17 @@ class Surroundings:
         return replace(found, numbers=np.concatenate([limbs, rest]))
 
 
-#: Ticks whose volumes are computed together.
-_AHEAD = 32
-
-
 @dataclass
 class Forecast:
     """Obstacles of a batch of ticks, at any horizon."""
 
     around: Surroundings
     states: HumanStates
+    ahead: int = 32  #: largest number of ticks after one whose volumes are computed with it
 
     def __post_init__(self) -> None:
         self.t_ns, self._first = self.states.ticks()
-        self._last: tuple[int, float] | None = None  # tick and horizon asked for last
+        self._last, self._lasted = (-1, 0.0), 0  # tick and horizon asked for last; ticks before it with that horizon
         self._ahead: dict[float, tuple[int, SweptVolumes]] = {}  # horizon -> first row, volumes from it on
 
     @cached_property
@@ -176,21 +173,19 @@ class Forecast:
         return self.around.obstacles(self.states, rows, people)
 
     def _volumes(self, tick: int, horizon_s: float) -> tuple[int, SweptVolumes]:
-        """Volumes of a tick, and their first row; those of the next ticks, too, if the tick before had this horizon.
+        """Volumes of a tick, and their first row; those of as many ticks after it as had this horizon before it.
 
-        So are the ticks of a robot that stands: to compute them together is faster, and other methods ask for them.
+        A robot that stands asks for one horizon: to compute its ticks together is faster, and other methods ask, too.
         """
         if horizon_s == self.around.prediction.horizon_s:
             return 0, self.full
-        rows, before = self.rows(tick), self._last
+        rows, self._lasted = self.rows(tick), self._lasted + 1 if self._last == (tick - 1, horizon_s) else 0
         self._last = tick, horizon_s
         first, found = self._ahead.get(horizon_s, (0, None))
         if found is None or not first <= rows.start <= rows.stop <= first + len(found):
-            ticks = _AHEAD if before == (tick - 1, horizon_s) else 1
-            first, end = rows.start, self.rows(min(tick + ticks, len(self.t_ns)) - 1).stop
-            found = self.person.volumes(horizon_s, first, end)
-            if ticks > 1:
-                self._ahead[horizon_s] = first, found
+            last = min(tick + min(self._lasted, self.ahead), len(self.t_ns) - 1)
+            first, found = rows.start, self.person.volumes(horizon_s, rows.start, self.rows(last).stop)
+            self._ahead[horizon_s] = first, found
         return first, found
 
     def until(self, horizon_s: Floats) -> list[Obstacles]:
