@@ -101,7 +101,8 @@ class TableWriter:
 
     def _flush(self, table: pa.Table) -> None:
         if self._writer is None:
-            self._writer = pq.ParquetWriter(self._path, table.schema, compression="zstd")
+            names = [field.name for field in table.schema if pa.types.is_string(field.type)]  # numbers hardly repeat
+            self._writer = pq.ParquetWriter(self._path, table.schema, compression="lz4", use_dictionary=names)
         self._writer.write_table(table.combine_chunks())
 
     def close(self) -> None:
