@@ -137,7 +137,14 @@ class RecordedLimbs:
 
 
 def recorded_future(t_ns: Ints, points_m: Floats, states: HumanStates, horizon_s: float | Floats) -> RecordedFuture:
-    """Returns the recorded future (t, t + T] of some ticks; see ``RecordedLimbs``."""
+    """Returns the recorded future (t, t + T] of some ticks.
+
+    Args:
+        t_ns: (m,) instants of the recorded points, increasing [ns].
+        points_m: (m, 20, 3) POINTS of the person, world [m]; NaN if not recorded or rejected.
+        states: (n,) the fused person at the ticks.
+        horizon_s: T, the prediction's horizon plus the latency, one per tick or one for all [s].
+    """
     return RecordedLimbs.of(t_ns, points_m).future(states, horizon_s)
 
 

@@ -207,6 +207,13 @@ def _directions() -> Floats:
     return unit
 
 
+def _levels(directions: Floats) -> tuple[Floats, Ints]:
+    found = [np.unique(column, return_inverse=True) for column in directions.T]
+    most = max(len(values) for values, _ in found)
+    padded = [np.append(values, np.full(most - len(values), np.nan)) for values, _ in found]
+    return np.stack(padded), np.stack([which for _, which in found]).astype(np.int64)
+
+
 def _inverses(A: Floats) -> Floats:
     """(n, 3, 3) inverses of matrices, by the cross products of their rows."""
     a, b, c = A[:, 0], A[:, 1], A[:, 2]
@@ -220,6 +227,9 @@ _TRIANGLES = _TRIANGLES[np.lexsort(np.sort(_TRIANGLES).T)]
 #: (corners, 3, 3): maps the extents along its three directions to a corner.
 _SOLUTIONS = _inverses(DIRECTIONS[_TRIANGLES])
 CORNERS = len(_TRIANGLES)
+#: For each axis the different components of the directions along it (levels,), NaN beyond their number; that of each
+#: direction (directions,).
+_LEVELS, _OF_LEVEL = _levels(DIRECTIONS)
 #: The directions as (3, directions), and the length of each across each axis.
 _COLUMNS = np.ascontiguousarray(DIRECTIONS.T)
 _ACROSS = np.sqrt(1.0 - _COLUMNS**2)
@@ -240,8 +250,11 @@ def reach_turning(points: Floats, count: int, axis: int, low: float, high: float
         high: Largest angle [rad].
         far: (directions,) largest extent so far along each of DIRECTIONS, raised in place [m].
     """
+    if high - low >= 2.0 * np.pi:
+        _reach_all_around(points, count, axis, far)
+        return
     i, j = (axis + 1) % 3, (axis + 2) % 3
-    middle, half = 0.5 * (low + high), min(0.5 * (high - low), np.pi)
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
     c, s, cos_half, sin_half = np.cos(middle), np.sin(middle), np.cos(half), np.sin(half)
     along, across, level = _COLUMNS[axis], _ACROSS[axis], np.empty((2, len(far)))
     for d in range(len(far)):  # the directions, turned back by the middle
@@ -256,6 +269,23 @@ def reach_turning(points: Floats, count: int, axis: int, low: float, high: float
             end = cos_half * facing + sin_half * abs(u[d] * y - v[d] * x)
             there = along[d] * z + (circle if facing >= cos_half * circle else end)
             far[d] = there if there > far[d] else far[d]
+
+
+@njit(cache=True, inner=True)
+def _reach_all_around(points: Floats, count: int, axis: int, far: Floats) -> None:
+    """As ``reach_turning`` for a whole turn: an extent depends only on the direction's component along the axis."""
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    of_level = _OF_LEVEL[axis]
+    along = _LEVELS[axis, : of_level.max() + 1]
+    top, across = np.full(len(along), -np.inf), np.sqrt(1.0 - along**2)
+    for k in range(count):
+        x, y, z = points[k, i], points[k, j], points[k, axis]
+        r = np.sqrt(x * x + y * y)
+        for m in range(len(along)):
+            there = along[m] * z + across[m] * r
+            top[m] = there if there > top[m] else top[m]
+    for d in range(len(far)):
+        far[d] = max(far[d], top[of_level[d]])
 
 
 @njit(cache=True)

@@ -358,7 +358,15 @@ def place(grid: Grid, s_s: float) -> tuple[Floats, Floats, Floats]:
 
 @njit(cache=True, inner=True)
 def write_place(grid: Grid, s_s: float, q: Floats, dq: Floats, ddq: Floats) -> None:
-    """Writes what ``place`` returns: the cubic through the grid points around ``s_s``, and its two derivatives."""
+    """Writes what ``place`` returns: the cubic through the grid points around a time, and its two derivatives.
+
+    Args:
+        grid: The path.
+        s_s: Programmed time [s].
+        q: (nv,) receives the position [rad].
+        dq: (nv,) receives the velocity [rad/s].
+        ddq: (nv,) receives the acceleration [rad/s^2].
+    """
     if not 0.0 <= s_s < grid.duration_s:
         q[:], dq[:], ddq[:] = grid.q[0 if s_s < 0.0 else grid.end], 0.0, 0.0
         return

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,13 @@ import pytest
 from hrcreplay.commands import replay, report
 from hrcreplay.evaluation import contact
 from hrcreplay.evaluation.contact import VOLUME_OF, Volumes
+from hrcreplay.evaluation.containment import Coverage
 from hrcreplay.evaluation.recorded_person import BodyTrack, RecordedPeople, RecordedPerson, SmoothedPeople, from_states
-from hrcreplay.human.model import PARTS
+from hrcreplay.human.model import PARTS, skeleton
 from hrcreplay.logs import reader
+from hrcreplay.logs.log_files import Truth
+from hrcreplay.pipeline import assembly
+from hrcreplay.pipeline.run_config import read_run_config
 from hrcreplay.records import LIMBS, POINTS, Floats, HumanStates, SweptVolume
 from hrcreplay.reporting import verdict
 from hrcreplay.robot.model import RobotModel, from_urdf
@@ -158,10 +163,10 @@ class Known:
         self.solid = {"LRA": SweptVolume(centre_m + 1e-3 * np.vstack([np.zeros(3), np.eye(3)]), radius_m)}
         self.asked: list[tuple[int, float]] = []
 
-    def volumes(self, t_ns: int, horizon_s: float, person: int) -> Volumes:
-        assert person == 1
-        self.asked.append((t_ns, horizon_s))
-        return self.solid
+    def volumes(self, asked: Sequence[tuple[int, float, int]]) -> list[Volumes]:
+        assert {person for _, _, person in asked} == {1}
+        self.asked += [(t_ns, horizon_s) for t_ns, horizon_s, _ in asked]
+        return [self.solid] * len(asked)
 
 
 def test_a_contact_is_laid_at_the_door_of_robot_or_prediction(robot: RobotModel) -> None:
@@ -226,6 +231,41 @@ def test_a_report_compares_every_method_with_the_truth(with_truth: Path) -> None
     found = verdict.verdict(run, report.compute(run, near_m=0.5, stationary_m_per_s=0.001))
     assert found is not None
     assert page.index(found.sentences[0]) < page.index(found.table.title)
+
+
+def test_coverage_does_not_depend_on_the_parts_in_which_the_ticks_come(with_truth: Path) -> None:
+    run_config = read_run_config(with_truth)
+    stage, fusion = assembly.prediction_stage(run_config), run_config.settings.fusion
+    truth = Truth.join(list(reader.open_log(run_config.log, run_config.settings.logs).truth()))
+    (states,) = read_states(with_truth / "state.parquet", 10_000)
+    person = RecordedPerson(1, "ground truth", truth.t_ns, truth.points_m, ())
+    horizon_s = np.random.default_rng(7).uniform(0.05, 0.4, len(states))
+    horizon_s[100:110] = np.nan
+    outcomes = []
+    for size in (len(states), 37, 5):
+        check = Coverage(stage, person, fusion, int(states.t_ns[-1]))
+        for first in range(0, len(states), size):
+            rows = slice(first, first + size)
+            check.add(states.rows(rows), horizon_s[rows])
+        outcomes.append(check.outcome())
+    whole, *others = outcomes
+    assert whole is not None
+    assert len(whole) > 10
+    for other in others:
+        assert other is not None
+        for name in ("t_ns", "beyond_m", "radius_m"):
+            np.testing.assert_array_equal(getattr(other, name), getattr(whole, name), name)
+
+
+def test_points_of_the_model_are_those_of_the_skeleton_where_the_person_is_known(with_truth: Path) -> None:
+    (states,) = read_states(with_truth / "state.parquet", 10_000)
+    track = from_states(SmoothedPeople.of(states), 0.3)
+    expected = skeleton(states.p, states.lengths_m)
+    np.testing.assert_array_equal(track.points_m[:], expected)
+    np.testing.assert_array_equal(track.points_m[np.array([7, 3, 3])], expected[[7, 3, 3]])
+    at_ns = states.t_ns[10] + np.arange(0, 40_000_000, 1_300_000)
+    copied = BodyTrack(track.source, track.t_ns, expected)
+    np.testing.assert_array_equal(track.axes_m(at_ns, 0.19), copied.axes_m(at_ns, 0.19))
 
 
 def test_without_truth_it_is_the_smoothed_person(

@@ -476,7 +476,7 @@ def motion_row(
     )
 
 
-class NearestPair(TypedDict):
+class PairRecord(TypedDict):
     """What a step and its row say of the nearest pair."""
 
     distance_m: float
@@ -485,7 +485,7 @@ class NearestPair(TypedDict):
     link: int
 
 
-def nearest_of(sight: Sight) -> NearestPair:
+def nearest_of(sight: Sight) -> PairRecord:
     """The nearest pair of link and limb of an observation."""
     overlap_m = math.nan if math.isnan(sight.distance_m) else sight.overlap_m
     return {"distance_m": sight.distance_m, "overlap_m": overlap_m, "limb": sight.limb, "link": sight.link}

@@ -1,0 +1,108 @@
+"""Volumes of many ticks at once, each until its own horizon, are those of each tick alone, bit for bit."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from hrcreplay.commands import replay
+from hrcreplay.human.model import skeleton
+from hrcreplay.logs.reader import open_log
+from hrcreplay.pipeline import assembly, stages
+from hrcreplay.pipeline.run_config import RunConfig, resolve
+from hrcreplay.pipeline.surroundings import Forecast, Surroundings
+from hrcreplay.records import POINTS, HumanStates, Motion
+from hrcreplay.robot.control.control_step import REASONS, motion_row
+from hrcreplay.robot.control.separation import Obstacles
+from hrcreplay.store.run_folder import Stopwatch
+from tests.pipeline.test_several_people import STAGE, crowd
+
+
+class NoTables:
+    """Tables that keep nothing."""
+
+    def table(self, name: str, columns: object, /) -> None:
+        """Forgets the rows."""
+
+
+@cache
+def demo(method: str) -> tuple[RunConfig, HumanStates]:
+    """A run of a method beside the person of the demo, and that person."""
+    overrides = (f"plan.method={method}", "plan.baselines=[]")
+    run_config = resolve(
+        "plan", replay.demo_log(), cell_file=replay.demo_cell(), overrides=overrides, start_s=8.0, end_s=9.5
+    )
+    log = open_log(run_config.log, run_config.settings.logs)
+    sink = stages.Sink(NoTables(), Stopwatch(time.perf_counter_ns), lambda _, __: None)
+    ticks_ns = stages.span_ticks(run_config, log)
+    fused = stages.fuse_batches(log, ticks_ns, 250, assembly.fusion_stage(run_config, log), sink)
+    return run_config, HumanStates.join(list(fused))
+
+
+def assert_same(found: Obstacles, expected: Obstacles) -> None:
+    for name in ("vertices_m", "offsets", "radius_m", "boxes_m"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), name)
+    assert (found.known, found.horizon_s, found.first) == (expected.known, expected.horizon_s, expected.first)
+    np.testing.assert_array_equal(found.numbers, expected.numbers)
+
+
+def test_the_robot_without_reaction_moves_the_same_in_a_batch_and_tick_by_tick() -> None:
+    run_config, states = demo("none")
+    log = open_log(run_config.log, run_config.settings.logs)
+    robot = assembly.robot(run_config, assembly.robot_base(run_config, log))
+    programme = assembly.programme(run_config, log, robot)
+    around, names = assembly.surroundings(run_config, robot), ("limb",) * 20
+    one, other = (assembly.planners(run_config, programme, int(states.t_ns[0]))["none"] for _ in range(2))
+    batch = one.follow(states.t_ns, Forecast(around, states), names)
+    alone = Forecast(around, states)
+    steps = [other.controller.step(alone.predict(tick)) for tick in range(len(states))]
+    rows = [motion_row(s.state, s.step, s.point.T_world_tcp[:3, 3], s.point.tcp_speed, s.programme_s) for s in steps]
+    expected = Motion.of_rows(states.t_ns, rows, limbs=names, links=batch.links, reasons=REASONS)
+    for name, value in vars(expected).items():
+        np.testing.assert_array_equal(getattr(batch, name), value, name)
+    assert np.isfinite(batch.distance_m).mean() > 0.9
+    assert len(set(batch.horizon_s.tolist())) > 10
+
+
+@pytest.mark.parametrize("method", ["sound", "paper", "positions"])
+def test_each_tick_has_its_own_horizon(method: str) -> None:
+    _, states = demo("none")
+    for people in (states.rows(slice(200, 260)), crowd(1, 2), crowd(3, 1, 2)):
+        around = Surroundings(STAGE.by(method), fresh_s=0.3)
+        forecast = Forecast(around, people)
+        horizon_s = np.random.default_rng(2).uniform(0.0, 0.4, len(forecast.t_ns))
+        for tick, found in enumerate(forecast.until(horizon_s)):
+            assert_same(found, Forecast(around, people).obstacles(tick, float(horizon_s[tick])))
+
+
+def test_a_body_that_counts_by_its_points_and_one_partly_seen_have_their_own_horizons() -> None:
+    _, states = demo("none")
+    people = states.rows(slice(200, 240))
+    unseen_s, p, shown_m = people.unseen_s.copy(), people.p.copy(), np.full((40, 2, len(POINTS), 3), np.nan)
+    unseen_s[10:20, :2] = 0.4  # the torso is out of sight, but one camera shows the arms
+    arms = [POINTS.index(f"{part}_{side}") for part in ("elbow", "wrist") for side in "lr"]
+    shown_m[10:20, 0, arms] = skeleton(p, people.lengths_m)[10:20, arms]
+    unseen_s[30:], p[30:] = np.inf, np.nan  # a body only just seen
+    changed = replace(people, unseen_s=unseen_s, p=p, camera_points_m=shown_m)
+    forecast = Forecast(Surroundings(STAGE, fresh_s=0.3), changed)
+    assert forecast.person.partly_seen.sum() >= 10
+    assert forecast.person.by_points.sum() == 10
+    horizon_s = np.linspace(0.0, 0.4, 40)
+    for tick, found in enumerate(forecast.until(horizon_s)):
+        assert_same(found, Forecast(Surroundings(STAGE, fresh_s=0.3), changed).obstacles(tick, float(horizon_s[tick])))
+
+
+def test_volumes_computed_ahead_are_those_asked_for() -> None:
+    _, states = demo("none")
+    around = Surroundings(STAGE, fresh_s=0.3)
+    forecast = Forecast(around, states)
+    asked = [0.1] * 40 + [0.1, 0.2, 0.2, 0.1] * 10 + [0.3] * (len(states) - 80)
+    for _ in range(2):  # two methods ask for the same
+        for tick, horizon_s in enumerate(asked):
+            assert_same(
+                forecast.obstacles(tick, horizon_s), Forecast(around, states, ahead=0).obstacles(tick, horizon_s)
+            )
