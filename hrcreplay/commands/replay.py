@@ -34,7 +34,7 @@ from hrcreplay.records import RECORDED, HumanStates, Ints
 from hrcreplay.reporting import tables
 from hrcreplay.reporting.summary_text import defect_notes
 from hrcreplay.store import run_folder
-from hrcreplay.store.columns import read_states, state_columns
+from hrcreplay.store.columns import read_states
 from hrcreplay.store.run_folder import RunWriter, Stopwatch
 
 REPORTS = Path("reports")
@@ -220,19 +220,12 @@ def run_stages(
     Returns:
         The findings of the stages that read the log.
     """
-    todo = [stage for stage in run_config.stages if stage not in reused]
+    todo, start_ns = [stage for stage in run_config.stages if stage not in reused], int(ticks_ns[0])
     states: Iterable[HumanStates]
     elsewhere: MethodsElsewhere | None = None
-
-    def store(people: HumanStates) -> None:
-        if elsewhere is None:
-            sink.tables.table("state", state_columns(people))
-        else:
-            elsewhere.store(people)
-
     if "fuse" in todo:
-        stages.write_truth(log, int(ticks_ns[0]), int(ticks_ns[-1]), sink)
-        fusion_stage = assembly.fusion_stage(run_config, log)
+        stages.write_truth(log, start_ns, int(ticks_ns[-1]), sink)
+        fusion_stage, store = assembly.fusion_stage(run_config, log), second is None or "plan" not in todo
         states = stages.fuse_batches(log, ticks_ns, size, fusion_stage, sink, smooth=smooth, store=store)
     else:
         states = read_states(folder / "state.parquet", size)
@@ -241,12 +234,12 @@ def run_stages(
         robot = assembly.robot(run_config, assembly.robot_base(run_config, log))
         programme = assembly.programme(run_config, log, robot)
         sink.notes["plan"].extend(programme.notes)
-        moved = assembly.followers(run_config, programme, int(ticks_ns[0]))
+        moved = assembly.followers(run_config, programme, start_ns)
         sink.notes["plan"].extend(assembly.scene_notes(run_config, log, moved))
         every = stages.store_every(run_config) if "predict" in todo else math.inf
         others = [name for name, one in moved.items() if not one.chosen and name != RECORDED]
         if second is not None:
-            elsewhere = MethodsElsewhere(second, run_config, int(ticks_ns[0]), others, folder)
+            elsewhere = MethodsElsewhere(second, run_config, start_ns, others, folder, fused="fuse" in todo)
             moved = {name: one for name, one in moved.items() if name not in others}
         flow = stages.plan_batches(states, assembly.surroundings(run_config, robot), moved, every, sink, elsewhere)
     elif "predict" in todo:

@@ -31,7 +31,7 @@ from hrcreplay.reporting.metrics.planning import add_plan
 from hrcreplay.reporting.metrics.series import Metric, MetricTable, start_ns
 from hrcreplay.reporting.movie import default_name, write_movie
 from hrcreplay.reporting.page import report_page
-from hrcreplay.reporting.page.replay_page import snapshot
+from hrcreplay.reporting.page.replay_page import ReplayPart, replay_part, snapshot
 from hrcreplay.reporting.replay_scene import ReplayScene, replay_scene
 from hrcreplay.reporting.safety_file import log_name, safety_file
 from hrcreplay.reporting.scene_mcap import foxglove_layout, write_scene
@@ -82,7 +82,8 @@ def write_report(
         radii["legs, of sound"] = prediction.legs_radius_m
     folder = writer.partial / "figures"
     kinds = catalogue.select_figures(run, found)
-    scene = scene_of(run_config, everybody)  # before the figures, of which the second process draws the rest meanwhile
+    here = None if elsewhere is not None else writer.partial / "scene.mcap"
+    replay = _make_replay(run_config, everybody, here)  # before the figures: meanwhile the second process draws some
     progress.begin("figures", len(kinds))
     _draw_figures(run_config, everybody, found, kinds, folder, progress=progress, second=second)
     progress.begin("page")
@@ -92,14 +93,21 @@ def write_report(
         tables.radius_table(radii),
     ]
     writer.text(
-        "report.html", report_page.render(run, found, folder, shown, stops=stops, scene=scene, people=everybody.people)
+        "report.html",
+        report_page.render(run, found, folder, shown, stops=stops, replay=replay, people=everybody.people),
     )
-    if scene is not None:
-        if elsewhere is None:
-            write_scene(writer.partial / "scene.mcap", scene, everybody.measurements)
-        else:
-            elsewhere.result()
+    if elsewhere is not None:
+        elsewhere.result()
+    if replay is not None:
         writer.text("foxglove-layout.json", foxglove_layout())
+
+
+def _make_replay(run_config: RunConfig, run: Run, path: Path | None) -> ReplayPart | None:
+    """Makes the replay of the page, and writes the scene to a path, if one is given; None for a run without a robot."""
+    scene = scene_of(run_config, run)
+    if scene is not None and path is not None:
+        write_scene(path, scene, run.measurements)
+    return None if scene is None else replay_part(scene)
 
 
 def _write_scene(run_config: RunConfig, folder: Path, meta: dict[str, Any]) -> None:

@@ -21,7 +21,7 @@ from hrcreplay.records import Floats, HumanStates, Ints
 from hrcreplay.store.columns import state_columns
 from hrcreplay.store.run_folder import FolderTables, Stopwatch
 
-#: Number of batches that may wait for the second process, each twice: about 2.5 kB per tick.
+#: Number of batches that may wait for the second process: about 2.5 kB per tick.
 _MOST_WAITING = 100
 #: Stage -> ticks and duration [ns] of each call.
 Calls = dict[str, list[tuple[int, int]]]
@@ -31,7 +31,7 @@ class MethodsElsewhere:
     """Sends the batches of a run to the second process."""
 
     def __init__(
-        self, second: Executor, run_config: RunConfig, start_ns: int, names: Sequence[str], folder: Path
+        self, second: Executor, run_config: RunConfig, start_ns: int, names: Sequence[str], folder: Path, *, fused: bool
     ) -> None:
         """Makes the robots of the second process.
 
@@ -41,20 +41,14 @@ class MethodsElsewhere:
             start_ns: First tick of the run [ns].
             names: The methods; none is the chosen one.
             folder: Receives the tables.
+            fused: True: the people are just fused, and their table is written, too.
         """
         self._second = second
-        self._sent = deque[Future[None]]([second.submit(_start, run_config, start_ns, names, folder)])
+        self._sent = deque[Future[None]]([second.submit(_start, run_config, start_ns, names, folder, fused)])
 
     def take(self, batch: HumanStates, stored: Ints, horizon_s: Floats) -> None:
         """Sends a batch; waits if too many are under way, and raises what a batch before has raised."""
-        self._send(self._second.submit(_take, batch, stored, horizon_s))
-
-    def store(self, states: HumanStates) -> None:
-        """Sends fused people for their table."""
-        self._send(self._second.submit(_store, states))
-
-    def _send(self, sent: Future[None]) -> None:
-        self._sent.append(sent)
+        self._sent.append(self._second.submit(_take, batch, stored, horizon_s))
         while len(self._sent) > _MOST_WAITING:
             self._sent.popleft().result()
 
@@ -68,8 +62,8 @@ class MethodsElsewhere:
 class _Work:
     """What the second process does for a run."""
 
-    def __init__(self, run_config: RunConfig, start_ns: int, names: Sequence[str], folder: Path) -> None:
-        log, self._tables = open_log(run_config.log, run_config.settings.logs), FolderTables(folder)
+    def __init__(self, run_config: RunConfig, start_ns: int, names: Sequence[str], folder: Path, fused: bool) -> None:
+        log, self._tables, self._fused = open_log(run_config.log, run_config.settings.logs), FolderTables(folder), fused
         self._sink = Sink(self._tables, Stopwatch(time.perf_counter_ns), lambda _, __: None)
         robot = assembly.robot(run_config, assembly.robot_base(run_config, log))
         self._surroundings = assembly.surroundings(run_config, robot)
@@ -77,12 +71,11 @@ class _Work:
         self._methods = MethodsFollowing(self._surroundings, {name: moved[name] for name in names}, self._sink)
 
     def take(self, batch: HumanStates, stored: Ints, horizon_s: Floats) -> None:
+        if self._fused:
+            self._tables.table("state", state_columns(batch))
         forecast = Forecast(self._surroundings, replace(batch))  # sent records are not protected
         self._methods.take(forecast)
         store_stored_ticks(forecast, stored, horizon_s, self._sink)
-
-    def store(self, states: HumanStates) -> None:
-        self._tables.table("state", state_columns(states))
 
     def finish(self) -> Calls:
         self._tables.close_tables()
@@ -93,16 +86,12 @@ class _Work:
 _UNDER_WAY: list[_Work] = []
 
 
-def _start(run_config: RunConfig, start_ns: int, names: Sequence[str], folder: Path) -> None:
-    _UNDER_WAY[:] = [_Work(run_config, start_ns, names, folder)]
+def _start(run_config: RunConfig, start_ns: int, names: Sequence[str], folder: Path, fused: bool) -> None:
+    _UNDER_WAY[:] = [_Work(run_config, start_ns, names, folder, fused)]
 
 
 def _take(batch: HumanStates, stored: Ints, horizon_s: Floats) -> None:
     _UNDER_WAY[0].take(batch, stored, horizon_s)
-
-
-def _store(states: HumanStates) -> None:
-    _UNDER_WAY[0].store(states)
 
 
 def _finish() -> Calls:

@@ -178,7 +178,7 @@ def fuse_batches(
     sink: Sink,
     *,
     smooth: bool = False,
-    store: Callable[[HumanStates], None] | None = None,
+    store: bool = True,
 ) -> Iterator[HumanStates]:
     """Stage 1: camera frames to the fused person; writes measurements and state and, if requested, ``smooth``.
 
@@ -189,12 +189,11 @@ def fuse_batches(
         fusion_stage: Cameras and settings of the stage.
         sink: Receives rows, counts and times.
         smooth: True: write the smoothed person at the end.
-        store: Writes the rows of state; None: to the tables of the sink.
+        store: False: the second process writes state.
 
     Raises:
         LogError: At the end: the log certainly shows no person, or no person was ever seen.
     """
-    store = store or (lambda states: sink.tables.table("state", state_columns(states)))
     fuser = PersonFuser(fusion_stage, log.header.cameras, traced=smooth)
     watched = fusion_stage.watched is not None
     frames = log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1, nobody=watched)
@@ -215,12 +214,12 @@ def fuse_batches(
             if sink.seen is not None:
                 sink.seen.add(sightings)
         if smooth:
-            for part in people.add(states, trace):
-                sink.tables.table("smooth", state_columns(part))
+            _write_smoothed(people.add(states, trace), sink)
         sink.counts.update(sightings.counts)
         sink.counts.update(events)
         ever = ever or bool(states.valid.any()) or max(fuser.area.vacant_ns) >= 0
-        store(states)
+        if store:
+            sink.tables.table("state", state_columns(states))
         sink.progress("fuse", len(ticks))
         yield states
     log.check()
@@ -233,8 +232,12 @@ def fuse_batches(
     sink.notes["fuse"].extend(_describe_area(log, fuser.area, sink.counts) if watched else ())
     sink.notes["fuse"].extend(_describe_others(sink.counts))
     if smooth:
-        for part in people.finish():
-            sink.tables.table("smooth", state_columns(part))
+        _write_smoothed(people.finish(), sink)
+
+
+def _write_smoothed(parts: Iterable[HumanStates], sink: Sink) -> None:
+    for part in parts:
+        sink.tables.table("smooth", state_columns(part))
 
 
 def _describe_others(counts: Counter[str]) -> Iterator[str]:

@@ -14,6 +14,7 @@ from hrcreplay.reporting import tables as wording
 from hrcreplay.reporting.figures import catalogue
 from hrcreplay.reporting.figures.catalogue import FigureData
 from hrcreplay.reporting.page import report_page
+from hrcreplay.reporting.page.replay_page import replay_part
 from hrcreplay.robot.control import control_step
 from tests.facts import tells
 from tests.reporting.moving import moving_run, moving_scene
@@ -218,5 +219,7 @@ def test_a_page_of_ten_minutes_stays_small(tmp_path: Path) -> None:
     assert len(scene.t_ns) == 15_000
     noise = np.random.default_rng(2).normal(scale=1e-3, size=scene.volumes.vertices_m.shape)
     volumes = dataclasses.replace(scene.volumes, vertices_m=scene.volumes.vertices_m + noise)
-    html = report_page.render(run, metrics_of(run), tmp_path, scene=dataclasses.replace(scene, volumes=volumes))
+    html = report_page.render(
+        run, metrics_of(run), tmp_path, replay=replay_part(dataclasses.replace(scene, volumes=volumes))
+    )
     assert len(html) < 11_000_000

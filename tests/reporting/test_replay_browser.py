@@ -11,7 +11,7 @@ import pytest
 
 from hrcreplay.geometry.distances import distances
 from hrcreplay.reporting.page import report_page
-from hrcreplay.reporting.page.replay_page import touching_pairs
+from hrcreplay.reporting.page.replay_page import replay_part, touching_pairs
 from hrcreplay.reporting.replay_scene import ReplayScene
 from hrcreplay.reporting.tour import telling_moment, tour
 from tests.reporting.browser import Tab, chromium, opened
@@ -32,7 +32,9 @@ def scene() -> ReplayScene:
 def file(scene: ReplayScene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     run, folder = moving_run(8.0), tmp_path_factory.mktemp("page")
     metrics = metrics_of(run)
-    (folder / "report.html").write_text(report_page.render(run, metrics, folder, scene=scene), encoding="utf-8")
+    (folder / "report.html").write_text(
+        report_page.render(run, metrics, folder, replay=replay_part(scene)), encoding="utf-8"
+    )
     return folder / "report.html"
 
 

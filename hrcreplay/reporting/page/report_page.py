@@ -18,8 +18,7 @@ from hrcreplay.reporting import summary_text
 from hrcreplay.reporting.figures.catalogue import FIGURES, FigureKind, file_name
 from hrcreplay.reporting.metrics.fusion import cameras
 from hrcreplay.reporting.metrics.series import Metric
-from hrcreplay.reporting.page.replay_page import replay_part
-from hrcreplay.reporting.replay_scene import ReplayScene
+from hrcreplay.reporting.page.replay_page import ReplayPart
 from hrcreplay.reporting.severity import severity_tables
 from hrcreplay.reporting.summary_text import defect_notes
 from hrcreplay.reporting.tables import (
@@ -74,7 +73,7 @@ def render(
     *,
     stops: Sequence[PageTable] = (),
     title: str = "",
-    scene: ReplayScene | None = None,
+    replay: ReplayPart | None = None,
     people: Sequence[int] = (1,),
 ) -> str:
     """Renders the page of a run.
@@ -86,7 +85,7 @@ def render(
         tables: Tables 1 and 2 as used, shown with the prediction.
         stops: The longest stops, shown with the safety.
         title: Name of the session; none: the name of the first input.
-        scene: Content of the 3-D replay; None: without a replay.
+        replay: The 3-D replay; None: without one.
         people: Numbers of the people in the run.
 
     Returns:
@@ -101,7 +100,7 @@ def render(
         title=title or (inputs[0]["name"] if inputs else "a session"),
         subtitle=_subtitle(run, metrics),
         verdict=verdict(run, metrics),
-        replay=None if scene is None else replay_part(scene),
+        replay=replay,
         answers=summary_text.answers(run, metrics),
         cards=summary_text.cards(run, metrics),
         parts=_parts(run, metrics, figures_dir, tables, stops, people),

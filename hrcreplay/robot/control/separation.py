@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -54,6 +55,7 @@ def obstacles(volumes: SweptVolumes, tick: int, horizon_s: float = math.inf) -> 
     return Obstacles(vertices, offsets, radius, around, known, horizon_s)
 
 
+@cache
 def no_obstacles() -> Obstacles:
     """No volumes, and it is known that there are none."""
     vertices, radius = np.empty((0, 3)), np.empty(0)

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -60,6 +60,7 @@ class StaticShapes(NamedTuple):
     pair_reach: Floats
 
 
+@lru_cache
 def no_shapes(links: int, axes: int) -> StaticShapes:
     """Nothing to keep clear of beside people, for a robot with so many links and axes."""
     vertices, pairs = np.empty((0, 3)), np.empty((0, 2), np.int64)
