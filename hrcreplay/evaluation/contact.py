@@ -20,7 +20,7 @@ import numpy as np
 
 from hrcreplay.evaluation.containment import Coverage, Outcome
 from hrcreplay.evaluation.recorded_person import BodyTrack, RecordedPeople, SmoothedPeople, read_people
-from hrcreplay.evaluation.severity import severity_table
+from hrcreplay.evaluation.severity import MET, severity_table
 from hrcreplay.geometry.distances import nearest_pair, protrusion_m
 from hrcreplay.human.model import LEG_PARTS, PARTS, part_radii
 from hrcreplay.logs.reader import Log
@@ -207,7 +207,7 @@ class _JudgedRun:
             own = compute_own_coverage(run_config, people, self.predicted, motion)
             until = (full or self.full)()
         rows = contact_table(run_config, self.robot, method, motion, people, self.predicted, own, until, capsules)
-        meetings = arrow_table(rows).to_pandas()
+        meetings = arrow_table({name: rows[name] for name in MET}).to_pandas()
         return rows, severity_table(run_config, self.robot, method, motion, meetings, people, capsules)
 
 

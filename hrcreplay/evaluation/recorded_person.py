@@ -269,11 +269,9 @@ def read_people(
         ticks_ns: (n,) ticks of the span, increasing [ns].
         fusion_stage: Cameras, and settings of stage 1.
         smoothed_people: Returns the smoothed people at these ticks; called for people without ground truth.
-        bodies: The bodies that stage 1 saw in the span; None: it is run again for them.
+        bodies: The bodies that stage 1 saw in the span, which are taken; None: it is run again for them.
     """
-    bodies = _see_bodies(log, ticks_ns, fusion_stage) if bodies is None else bodies
-    seen = CameraFrames.join(bodies.people) if bodies.people else None
-    others = CameraFrames.join(bodies.others) if bodies.others else None
+    seen, others = (_see_bodies(log, ticks_ns, fusion_stage) if bodies is None else bodies).take()
     truth = _truth(log, ticks_ns)
     of_truth = 1 if truth is None or seen is None else _nearest_to(truth, seen)
     people = []

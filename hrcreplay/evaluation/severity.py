@@ -37,6 +37,8 @@ MERGED_S = 0.2
 #: Forearm -> the hand at its end.
 _HAND = {"LRA": "HAND_R", "LLA": "HAND_L"}
 CONTACT, NEAREST = "contact", "nearest"
+#: Columns of contact.parquet that it needs.
+MET = ("t_ns", "moving", "distance_m", "source")
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,7 @@ def severity_table(
         robot: Robot at its base pose in the world.
         method: Method of the motion.
         motion: Rows of a motion table.
-        contact: Rows of contact.parquet of the same ticks.
+        contact: Rows of contact.parquet of the same ticks, at least the columns MET.
         people: Recorded people.
         capsules: The robot as recorded by its capsules, in place of the links of ``robot``; None: no such robot.
     """

@@ -50,6 +50,13 @@ class SeenBodies:
         if len(others):
             self.others.append(others)
 
+    def take(self) -> tuple[CameraFrames | None, CameraFrames | None]:
+        """Returns the people and all others, None for no rows; it is empty then, as a long run's take memory."""
+        people, others = (CameraFrames.join(parts) if parts else None for parts in (self.people, self.others))
+        self.people.clear()
+        self.others.clear()
+        return people, others
+
 
 def as_frames(measured: Measurements) -> CameraFrames:
     """Measurements as frames, their points in the world, with the number of the person as body id."""
