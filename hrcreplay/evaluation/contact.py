@@ -133,7 +133,7 @@ def write_contact(
         log: Log of the run.
         writer: Run folder with complete tables.
         T_world_base: (4, 4) robot base in the world.
-        second: A second process, which takes the motions other than the chosen one; None: no such process.
+        second: A second process, which takes every other motion beside the chosen one; None: no such process.
         seen: The bodies that stage 1 saw; None: the log is read again for them.
     """
     people = read_recorded_people(run_config, log, writer, seen)
@@ -143,17 +143,17 @@ def write_contact(
     if second is not None:
         second.submit(_take_there, judged)
         full = second.submit(_full_there).result
-        there = {path: second.submit(_tables_there, path) for path in paths[1:]}
+        every_other = [path for path in paths[1:] if path.stem != f"motion_{RECORDED}"][::2]
+        there = {path: second.submit(_tables_there, path) for path in every_other}
     found: dict[Path, tuple[Columns, Columns]] = {}
-    for path in [*paths[:1], *paths[:0:-1]]:  # the chosen motion, then the last ones until the second process is met
+    for path in [path for path in paths if path not in there]:
         motion, capsules = StoredTable(path), None
         if path.stem == "motion":
             shown_ns = motion["t_ns"].to_numpy()[:: max(1, round(run_config.settings.fusion.rate_hz / _BODY_HZ))]
             writer.table("body", body_table(people, shown_ns, run_config.settings.prediction.hand_m))
         if path.stem == f"motion_{RECORDED}" and motion["q1"].isna().all():
             capsules, _ = assembly.recorded_capsules(log, T_world_base)
-        if path not in there or capsules is not None or there[path].cancel():
-            found[path] = judged.tables(path, capsules, full)
+        found[path] = judged.tables(path, capsules, full)
     for path in paths:
         rows, meetings = found.pop(path) if path in found else there.pop(path).result()
         writer.table("contact", rows)
