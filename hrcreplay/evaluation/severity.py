@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
+from itertools import islice
 
 import numpy as np
 import pandas as pd
@@ -37,6 +38,8 @@ MERGED_S = 0.2
 #: Forearm -> the hand at its end.
 _HAND = {"LRA": "HAND_R", "LLA": "HAND_L"}
 CONTACT, NEAREST = "contact", "nearest"
+#: Ticks whose bodies are placed together.
+_BATCH = 4096
 #: Columns of contact.parquet that it needs.
 MET = ("t_ns", "moving", "distance_m", "source")
 
@@ -107,10 +110,11 @@ def severity_table(
     meeting = Meeting(robot, capsules, mass, people.names, people.tracks, radii_m, settings.prediction.hand_m)
     distance, moving = contact["distance_m"].to_numpy(dtype=float), contact["moving"].to_numpy(dtype=bool)
     t_ns = contact["t_ns"].to_numpy()
-    found = []
-    for first, last in merged_runs(moving & (distance <= 0.0), t_ns):
-        ticks = first + np.flatnonzero((moving & (distance <= 0.0))[first:last])
-        impacts = list(meeting.impacts(method, CONTACT, motion, contact, ticks))
+    found, touching = [], moving & (distance <= 0.0)
+    every = meeting.impacts(method, CONTACT, motion, contact, np.flatnonzero(touching))
+    for first, last in merged_runs(touching, t_ns):
+        ticks = first + np.flatnonzero(touching[first:last])
+        impacts = list(islice(every, len(ticks)))
         worst = max(impacts, key=lambda one: (np.nan_to_num(one.share, nan=-1.0), np.nan_to_num(one.relative_speed)))
         found.append(_lasting(worst, float(t_ns[ticks[-1]] - t_ns[ticks[0]]) * 1e-9 + _tick_s(t_ns)))
     near = np.where(moving & np.isfinite(distance), distance, np.inf)
@@ -178,13 +182,29 @@ class Meeting:
             contact: Rows of contact.parquet of the same ticks.
             ticks: (k,) rows at which a body is known.
         """
-        t_ns = contact["t_ns"].to_numpy()[ticks]
+        t_ns, source = contact["t_ns"].to_numpy()[ticks], contact["source"].iloc[ticks].to_numpy().astype(str)
         names = [f"q{i + 1}" for i in range(self.robot.nv)]
         q, dq = (motion[[f"{d}{name}" for name in names]].to_numpy(dtype=float)[ticks] for d in ("", "d"))
+        for first in range(0, len(ticks), _BATCH):
+            rows = slice(first, first + _BATCH)
+            yield from self._impacts((method, kind), t_ns[rows], q[rows], dq[rows], source[rows])
+
+    def _impacts(
+        self, named: tuple[str, str], t_ns: Ints, q: Floats, dq: Floats, source: NDArray[np.str_]
+    ) -> Iterator[Impact]:
+        """Yields the contact at each of some ticks.
+
+        Args:
+            named: Method, and CONTACT or NEAREST.
+            t_ns: (k,) the ticks [ns].
+            q: (k, nv) positions of the axes [rad].
+            dq: (k, nv) their velocities [rad/s].
+            source: (k,) name of the track of the body that is nearest.
+        """
+        method, kind = named
         ends_m, velocity, radius_m, links = self._links(q, dq, t_ns)
-        source = contact["source"].to_numpy()[ticks].astype(str)
         half_ns, around_m = self._around(t_ns, source)
-        for i in range(len(ticks)):
+        for i in range(len(t_ns)):
             axes_m = around_m[i, 1]
             pair = nearest_pair(ends_m[i : i + 1], radius_m[i], axes_m[None], self.radii_m)
             link, part = int(pair.first[0]), int(pair.second[0])
