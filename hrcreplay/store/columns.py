@@ -133,7 +133,7 @@ def missing_columns(path: Path) -> tuple[str, ...]:
 def read_states(path: Path, chunk_ticks: int) -> Iterator[HumanStates]:
     """Reads state.parquet into records, bit for bit, about ``chunk_ticks`` rows at a time; no tick is divided."""
     pending: HumanStates | None = None
-    with pq.ParquetFile(path) as file:
+    with pq.ParquetFile(path, pre_buffer=False) as file:  # the buffer would hold the whole file until the end
         cameras = _cameras(file)
         for batch in file.iter_batches(batch_size=chunk_ticks):
             states = _states(
