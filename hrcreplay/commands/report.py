@@ -154,37 +154,36 @@ def _draw_figures(
         folder: Folder for the files.
         pdf: True: also as PDF.
         progress: Receives the progress.
-        second: A second process, which draws the last people's until it meets this one; None: no such process.
+        second: A second process, which draws the last ones until it meets this one; None: no such process.
 
     Returns:
         The names drawn.
     """
-    tasks = [
-        _Drawing(
-            run_config,
-            folder,
-            tuple(kind.name for kind in kinds if number == everybody.people[0] or kind.each),
-            number,
-            pdf,
-        )
-        for number in everybody.people
-    ]
-    there: dict[int, Future[tuple[str, ...]]] = {}
+    tasks = []
+    for number in everybody.people:
+        names = [kind.name for kind in kinds if number == everybody.people[0] or kind.each]
+        few = [tuple(names[first : first + _FEW]) for first in range(0, len(names), _FEW)]
+        tasks += [_Drawing(run_config, folder, some, number, pdf) for some in few]
+    there: dict[_Drawing, Future[tuple[str, ...]]] = {}
     if second is not None:
         given = everybody.folder, json.dumps(everybody.meta), metrics
-        there = {task.number: second.submit(task.draw_there, *given) for task in tasks[:0:-1]}
+        there = {task: second.submit(task.draw_there, *given) for task in tasks[:0:-1]}
     drawn: list[str] = []
     for task in tasks:
-        if task.number not in there or there[task.number].cancel():
+        if task not in there or there[task].cancel():
             drawn += task.draw(everybody, metrics, lambda: progress.advance("figures"))
         else:
-            drawn += there[task.number].result()
+            drawn += there[task].result()
     return drawn
 
 
-@dataclass(frozen=True)
+#: Figures that one process draws at a time.
+_FEW = 3
+
+
+@dataclass(frozen=True, eq=False)
 class _Drawing:
-    """The figures of one person to draw, in either process."""
+    """Some figures of one person to draw, in either process."""
 
     run_config: RunConfig
     folder: Path  #: for the files

@@ -58,6 +58,7 @@ def test_two_processes_write_the_same_bytes_as_one(tmp_path: Path, monkeypatch: 
     assert set(taken) == {"_start", "_take", "_finish", "_take_there", "_full_there", "_tables_there"} | {
         "_forget_there",
         "_write_scene",
+        "draw_there",
     }
 
 
