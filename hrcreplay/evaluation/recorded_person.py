@@ -66,7 +66,7 @@ _BONES: tuple[tuple[str, str, str, float], ...] = (
 )
 #: Maximum difference between a bone and the person's bone length; people differ from the model [m].
 _BONE_M = 0.08
-#: Number of ticks fused per batch.
+#: Number of ticks fused, or of frames selected, per batch.
 _BATCH = 15_000
 
 
@@ -338,7 +338,8 @@ def _recorded_person(
     smoothed = from_states(best, fusion_stage.filter.memory_s)
     if seen is None or not len(seen):
         return RecordedPerson(number, SMOOTHED, smoothed.t_ns, smoothed.points_m[:], (smoothed,))
-    points, _ = _select_accepted(seen, best, fusion_stage)
+    parts = [seen.rows(slice(first, first + _BATCH)) for first in range(0, len(seen), _BATCH)]
+    points = np.concatenate([_select_accepted(part, best, fusion_stage)[0] for part in parts])
     source, t_ns, points_m = _recorded_points(seen, points, best)
     cameras = [
         _track(camera, seen.capture_ns[mine], points[mine])
@@ -364,7 +365,7 @@ def _truth(log: Log, ticks_ns: Ints) -> BodyTrack | None:
 def _track(source: str, t_ns: Ints, points_m: Floats) -> BodyTrack:
     """Makes a camera's track, in order of capture; the neck is the middle of the shoulders, if they are known."""
     order = np.argsort(t_ns, kind="stable")
-    t_ns, points_m = t_ns[order], points_m[order].copy()
+    t_ns, points_m = t_ns[order], points_m[order]
     neck, right, left = (POINTS.index(name) for name in ("neck", "shoulder_r", "shoulder_l"))
     middle = 0.5 * (points_m[:, right] + points_m[:, left])
     points_m[:, neck] = np.where(np.isnan(middle), points_m[:, neck], middle)
