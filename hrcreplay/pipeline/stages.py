@@ -227,12 +227,29 @@ def fuse_batches(
         raise _nobody(log, sink.counts)
     with sink.watch.stage("clocks", len(ticks_ns)):
         sink.notes["fuse"].extend(clocks.remarks())
-    sink.notes["fuse"].extend(_describe_late_frames(log, sink.counts, fusion_stage.clock_offset_ns))
-    checks.write(sink)
-    sink.notes["fuse"].extend(_describe_area(log, fuser.area, sink.counts) if watched else ())
-    sink.notes["fuse"].extend(_describe_others(sink.counts))
+    _note_findings(log, fusion_stage.clock_offset_ns, checks, fuser.area if watched else None, sink)
     if smooth:
         _write_smoothed(people.finish(), sink)
+
+
+def _note_findings(
+    log: Log, clock_offset_ns: Ints, checks: PeopleChecks, area: vacancy.VacancyState | None, sink: Sink
+) -> None:
+    """Writes the checks of cameras and people, and notes what stage 1 found.
+
+    Args:
+        log: The log, which is read to its end.
+        clock_offset_ns: (c,) offset of each camera's clock [ns].
+        checks: The checks.
+        area: Last state of the watched area; None: there is none.
+        sink: Receives rows and notes.
+    """
+    notes = sink.notes["fuse"]
+    notes.extend(_describe_late_frames(log, sink.counts, clock_offset_ns))
+    checks.write(sink)
+    if area is not None:
+        notes.extend(_describe_area(log, area, sink.counts))
+    notes.extend(_describe_others(sink.counts))
 
 
 def _write_smoothed(parts: Iterable[HumanStates], sink: Sink) -> None:

@@ -104,11 +104,16 @@ class StoredTable:
         return StoredTable(self._file, columns, self._rows, self._made | values)
 
     def at(self, places: Ints) -> pd.DataFrame:
-        """Some rows, by their places in ascending order, with all columns."""
-        rows = np.zeros(self._file.length, dtype=np.bool_)
-        rows[places if self._rows is None else np.flatnonzero(self._rows)[places]] = True
-        made = {name: values[places] for name, values in self._made.items()}
-        return StoredTable(self._file, self.columns, rows, made)._read(list(self.columns), rows)  # noqa: SLF001
+        """Some rows, by their places, with all columns.
+
+        Raises:
+            IndexError: The places do not ascend, as rows are read in the order of the file.
+        """
+        if (np.diff(places) <= 0).any():
+            raise IndexError("the places of rows must ascend")
+        mask = np.zeros(len(self), dtype=np.bool_)
+        mask[places] = True
+        return self._where(mask)[list(self.columns)]
 
     def _read(self, names: list[str], rows: Bools | None) -> pd.DataFrame:
         if absent := [name for name in names if name not in self.columns]:

@@ -81,6 +81,9 @@ def test_rows_by_their_places(tables: tuple[StoredTable, pd.DataFrame]) -> None:
             assert table.iloc[place].to_dict() == pytest.approx(whole.iloc[place].to_dict(), nan_ok=True)
     with pytest.raises(IndexError):
         stored.iloc[N]
+    for places in (slice(None, None, -1), np.array([3, 3])):
+        with pytest.raises(IndexError, match="ascend"):
+            stored.iloc[places]
 
 
 def test_columns_left_out_and_columns_made(tables: tuple[StoredTable, pd.DataFrame]) -> None:

@@ -7,6 +7,7 @@ normal of a contact is that of the axis of the link, which is at most that of th
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,7 +68,7 @@ def end_speeds(pose: RobotPose, dq: Floats) -> Floats:
 
 @njit(cache=True)
 def largest_rate(pose: RobotPose, towards: Floats, speeds: Floats) -> float:
-    """Largest rate at which no end of a link is faster than its limit.
+    """Largest rate at which no end of a link is faster than its limit; NaN, which allows none, if any is not known.
 
     Args:
         pose: The robot.
@@ -79,8 +80,10 @@ def largest_rate(pose: RobotPose, towards: Floats, speeds: Floats) -> float:
         return rate
     moving = end_speeds(pose, towards)
     for s in range(len(speeds)):
-        if moving[s] > SLOW and not rate <= speeds[s] / moving[s]:  # a speed that is NaN allows none
-            rate = speeds[s] / moving[s]
+        if math.isnan(speeds[s]) or math.isnan(moving[s]):
+            return np.nan
+        if moving[s] > SLOW:
+            rate = min(rate, speeds[s] / moving[s])
     return rate
 
 

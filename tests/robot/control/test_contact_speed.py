@@ -66,6 +66,10 @@ def test_at_the_largest_rate_one_link_has_its_limit_and_none_is_faster() -> None
         reached = moved(robot, q, rate * towards) / limits
         assert 1.0 - 1e-4 < reached.max() < 1.0 + 1e-4
     assert largest_rate(robot.pose(q, np.zeros(6)), np.zeros(6), limits) == math.inf
+    for link in range(5):
+        unknown = limits.copy()
+        unknown[link] = math.nan
+        assert math.isnan(largest_rate(pose, towards, unknown)), "no rate is known to be slow enough"
 
 
 def test_some_volumes_are_those_volumes() -> None:
