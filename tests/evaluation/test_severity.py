@@ -148,6 +148,23 @@ def tables(ran: Path, method: str) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataF
     )
 
 
+def test_a_row_is_the_worst_of_its_contacts_ticks_each_looked_at_alone(ran: Path) -> None:
+    meeting, several = read_meeting(ran), 0
+    for method in ("none", "pfl"):
+        motion, contact, met = tables(ran, method)
+        touching = ((contact["distance_m"] <= 0.0) & contact["moving"]).to_numpy()
+        runs = merged_runs(touching, contact["t_ns"].to_numpy())
+        for (first, last), (_, row) in zip(runs, met[met["kind"] == CONTACT].iterrows(), strict=True):
+            ticks = first + np.flatnonzero(touching[first:last])
+            each = [next(meeting.impacts(method, CONTACT, motion, contact, np.array([tick]))) for tick in ticks]
+            worst = max(each, key=lambda one: (np.nan_to_num(one.share, nan=-1.0), np.nan_to_num(one.relative_speed)))
+            assert (row["t_ns"], row["transient_n"], row["energy_j"]) == pytest.approx(
+                (worst.t_ns, worst.transient_n, worst.energy_j), rel=1e-12, nan_ok=True
+            )
+            several += worst.t_ns != each[0].t_ns
+    assert several > 0, "the worst tick is not always the first"
+
+
 def test_each_contact_has_its_row_and_a_method_without_one_its_nearest_tick(ran: Path) -> None:
     assert tuple(pq.read_schema(ran / "severity.parquet").names) == COLUMNS["severity"]
     for method in METHODS:
