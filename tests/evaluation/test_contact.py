@@ -257,6 +257,24 @@ def test_coverage_does_not_depend_on_the_parts_in_which_the_ticks_come(with_trut
             np.testing.assert_array_equal(getattr(other, name), getattr(whole, name), name)
 
 
+def test_volumes_are_those_of_the_last_state_that_is_not_later(with_truth: Path) -> None:
+    stage = assembly.prediction_stage(read_run_config(with_truth))
+    (states,) = read_states(with_truth / "state.parquet", 10_000)
+    rows, horizons_s = (120, 30, 30, len(states) - 1), (0.1, 0.2, 0.3, 0.05)
+    at_ns = [int(states.t_ns[row]) + after for row, after in zip(rows, (0, 1000, 0, 10**9), strict=True)]
+    asked = [(t_ns, horizon_s, 1) for t_ns, horizon_s in zip(at_ns, horizons_s, strict=True)]
+    predicted = contact.Predicted(stage, with_truth / "state.parquet")
+    *found, before = predicted.volumes([*asked, (int(states.t_ns[0]) - 1, 0.1, 1)])
+    assert before == {}
+    for volumes, row, horizon_s in zip(found, rows, horizons_s, strict=True):
+        expected = stage.volumes(states.of_person(1).rows(slice(row, row + 1)), horizon_s).at(0)
+        assert set(volumes) == set(expected)
+        for limb, volume in volumes.items():
+            np.testing.assert_array_equal(volume.vertices_m, expected[limb].vertices_m)
+            assert volume.radius_m == expected[limb].radius_m
+    assert predicted.volumes([(at_ns[0], 0.1, 2)]) == [{}], "nobody has that number"
+
+
 def test_points_of_the_model_are_those_of_the_skeleton_where_the_person_is_known(with_truth: Path) -> None:
     (states,) = read_states(with_truth / "state.parquet", 10_000)
     track = from_states(SmoothedPeople.of(states), 0.3)
