@@ -84,7 +84,6 @@ def write_report(
     kinds = catalogue.select_figures(run, found)
     here = None if elsewhere is not None else writer.partial / "scene.mcap"
     replay = _make_replay(run_config, everybody, here)  # before the figures: meanwhile the second process draws some
-    progress.begin("figures", len(kinds))
     _draw_figures(run_config, everybody, found, kinds, folder, progress=progress, second=second)
     progress.begin("page")
     shown = [
@@ -169,11 +168,14 @@ def _draw_figures(
         given = everybody.folder, json.dumps(everybody.meta), metrics
         there = {task: second.submit(task.draw_there, *given) for task in tasks[:0:-1]}
     drawn: list[str] = []
+    progress.begin("figures", sum(len(task.names) for task in tasks))
     for task in tasks:
         if task not in there or there[task].cancel():
             drawn += task.draw(everybody, metrics, lambda: progress.advance("figures"))
         else:
-            drawn += there[task].result()
+            found = there[task].result()
+            progress.advance("figures", len(found))
+            drawn += found
     return drawn
 
 
