@@ -5,7 +5,8 @@
 All points of a recording but elbows and wrists go out of sight for the second half of every three seconds. Against what
 was recorded without that, shortly after it and once the filter has forgotten the torso: the share of ticks in which
 every recorded limb stayed whole in its volume until the braking time, and the mean volume of the union beside that of
-the same ticks with everything in sight.
+the same ticks with everything in sight. And the last volume that there would be, were the points that are seen
+known to go no further than limbs of people seen whole depart: at ``SLOWLY`` of people's speeds.
 """
 
 from __future__ import annotations
@@ -15,12 +16,15 @@ import json
 import tempfile
 from dataclasses import replace
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 
 from hrcreplay.commands import replay
 from hrcreplay.evaluation.containment import body_radii_m, check_containment, recorded_future
 from hrcreplay.evaluation.recorded_person import Recording, read_recording
+from hrcreplay.human.prediction import shown_points
+from hrcreplay.human.prediction.velocity_tube import PEOPLES_SPEEDS
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.logs.writer import LogWriter
 from hrcreplay.pipeline import assembly
@@ -29,7 +33,7 @@ from hrcreplay.pipeline.stages import span_ns, tick_times
 from hrcreplay.pipeline.surroundings import PredictionStage
 from hrcreplay.records import BODY, POINTS, HumanStates, Ints
 from tests.tools import bases
-from tests.tools.readme.measurements import PARTLY_SEEN_OF
+from tests.tools.readme.measurements import PARTLY_SEEN_OF, SLOWLY
 
 SHOWN = tuple(f"{point}_{side}" for point in ("elbow", "wrist") for side in "rl")
 _EVERY_S, _HIDDEN_S, _SECONDS = 3.0, 1.5, 20.0
@@ -83,6 +87,8 @@ def measure(name: str, tmp: Path) -> dict[str, float]:
         for what, states in zip(WHAT, (partly, whole.states), strict=True):
             held, union_m3 = judge(stage, whole, states.rows(ticks))
             found |= {f"{when}_{what}_held": held, f"{when}_{what}_m3": union_m3}
+    with mock.patch.object(shown_points, "PEOPLES_SPEEDS", SLOWLY * PEOPLES_SPEEDS):
+        found[f"{WHEN[1]}_slow_m3"] = judge(stage, whole, partly.rows(ticks))[1]
     return found
 
 
@@ -101,7 +107,7 @@ def told(name: str, found: dict[str, float]) -> str:
         f"{when}: " + ", ".join(f"{w} {found[f'{when}_{w}_held']:.1%}, {found[f'{when}_{w}_m3']:.1f} m3" for w in WHAT)
         for when in WHEN
     ]
-    return f"{name} | {' | '.join(each)}"
+    return f"{name} | {' | '.join(each)} | slow: {found[f'{WHEN[1]}_slow_m3']:.1f} m3"
 
 
 def parser() -> argparse.ArgumentParser:

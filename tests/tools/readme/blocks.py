@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +14,15 @@ from hrcreplay import limits
 from hrcreplay.reporting.tables import centimetres, share_text
 from tests.tools.readme.measurements import (
     BASELINES,
+    COST_FACTORS,
+    COST_HORIZONS,
     HORIZONS_MS,
     MARGINS,
     ORACLED,
     PARTLY_SEEN_OF,
     PLACES,
     RECORDINGS,
+    SLOWLY,
     VARIANTS,
     Figures,
 )
@@ -28,6 +31,8 @@ Facts = Mapping[str, Any]
 Row = Iterable[str]
 
 PEOPLE = Path(limits.__file__).parent / "people.toml"
+#: Share of ticks in which whole people are to be held.
+_OFTEN = 0.99
 BLOCK = re.compile(r"(<!-- figures: (\w+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
 
 
@@ -219,9 +224,31 @@ def partly_seen(facts: Facts) -> str:
     of, rows = _of(facts, "partly seen"), []
     for name in PARTLY_SEEN_OF:
         each = [f"{name} {when}_{what}" for when in ("just", "long") for what in ("partly", "whole")]
-        rows.append([name, *(f"{_share(of[f'{one}_held'])}, {_m3(of[f'{one}_m3'])}" for one in each)])
+        cells = [f"{_share(of[f'{one}_held'])}, {_m3(of[f'{one}_m3'])}" for one in each]
+        rows.append([name, *cells, _m3(of[f"{name} long_slow_m3"])])
     heads = [f"{when}, {what}" for when in ("0.1 to 0.5 s", "longer") for what in ("arms alone", "everything in sight")]
-    return _table(["recording", *heads], rows)
+    return _table(["recording", *heads, f"longer, arms alone, at {SLOWLY:g} of the speeds"], rows)
+
+
+def coverage_cost(facts: Facts) -> str:
+    """Share of people held and mean union, for narrower lines than those shipped."""
+    of, until = _of(facts, "coverage cost"), [f"{1000 * h:.0f} ms" for h in _departures()["horizon_s"]]
+    rows = []
+    for factor in COST_FACTORS:
+        pairs = [[of[f"{factor:g} {key} {k}"] for key in ("shares", "union_m3")] for k in range(COST_HORIZONS)]
+        rows.append([f"{factor:g}", *(f"{_share(share)}, {_m3(size)}" for share, size in pairs)])
+    words = (
+        "The narrowest of these lines that hold whole people in 99 % of the ticks take "
+        f"{_least_m3(of, until, 2)} and {_least_m3(of, until, COST_HORIZONS - 1)}: bounds of this form, balls that grow "
+        "with the horizon, with what the cameras show of a limb beside the model and with its speed, need that much."
+    )
+    return f"{_table(['lines times', *until], rows)}\n\n{_wrapped(words)}"
+
+
+def _least_m3(of: Figures, until: Sequence[str], k: int) -> str:
+    """The smallest mean union that holds people often enough at a horizon."""
+    enough = [of[f"{factor:g} union_m3 {k}"] for factor in COST_FACTORS if of[f"{factor:g} shares {k}"] >= _OFTEN]
+    return f"{_m3(min(enough))} at {until[k]}" if enough else f"more than all of these at {until[k]}"
 
 
 def _departures() -> dict[str, Any]:
@@ -271,6 +298,7 @@ BLOCKS: dict[str, Callable[[Facts], str]] = {
     "misses": misses,
     "oracle": oracle,
     "partly_seen": partly_seen,
+    "coverage_cost": coverage_cost,
     "margins": margins,
 }
 

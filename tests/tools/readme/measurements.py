@@ -76,9 +76,15 @@ SAMPLES = {
 #: What measures the pace of a controller that knows the future, on recordings by others, too.
 ORACLE = "tests.tools.oracle"
 ORACLED = ("demo", "azure walking", "azure moving", "kinect 2 lines", "kinect 2 sitting", "exp_box")
+#: Share of people's speeds at which a point goes as far within the braking time as a limb seen whole departs.
+SLOWLY = 0.4
 #: What hides people but for their arms, and in which recordings.
 PARTLY_SEEN = "tests.tools.partly_seen"
 PARTLY_SEEN_OF = ("demo", "azure walking", "azure squatting", "azure moving")
+#: What it takes to hold people: which tool, and the factors and horizons that are told.
+COVERAGE_COST = "tests.tools.coverage_cost"
+COST_FACTORS = (0.6, 0.7, 0.8, 0.9, 1.0)
+COST_HORIZONS = 5
 #: Recordings by others: name in the README -> name in tests/test_recordings.py, or the bag.
 RECORDINGS = {
     "Azure Kinect, walking": "azure walking",
@@ -91,6 +97,8 @@ RECORDINGS = {
     "motion capture, `exp_box`": "exp_box",
     "motion capture, `exp_appraoching`": "exp_appraoching",
 }
+#: All that need others' recordings.
+_OF_OTHERS = (ORACLE, PARTLY_SEEN, COVERAGE_COST)
 
 
 @dataclass(frozen=True)
@@ -108,7 +116,7 @@ class Measurement:
     @property
     def needs_data(self) -> bool:
         """Whether it needs recordings by others."""
-        return any("{data}" in command or command.startswith((ORACLE, PARTLY_SEEN)) for command in self.commands)
+        return any("{data}" in command or command.startswith(_OF_OTHERS) for command in self.commands)
 
 
 def of_report(metrics: Mapping[str, Any]) -> Figures:
@@ -153,6 +161,16 @@ def of_partly_seen(found: Mapping[str, Any]) -> Figures:
     return {f"{name} {key}": value for name in PARTLY_SEEN_OF for key, value in found[name].items()}
 
 
+def of_coverage_cost(found: Mapping[str, Any]) -> Figures:
+    """What is kept of what it takes to hold people, factor by factor."""
+    return {
+        f"{factor:g} {key} {k}": found[f"{factor:g}"][key][k]
+        for factor in COST_FACTORS
+        for key in ("shares", "union_m3")
+        for k in range(COST_HORIZONS)
+    }
+
+
 def measurements() -> list[Measurement]:
     """All of them, the quick ones first."""
     found = [_audit("audit demo", (DEMO,), {})]
@@ -170,6 +188,8 @@ def measurements() -> list[Measurement]:
     found.append(
         Measurement("partly seen", (f"{PARTLY_SEEN} --json {shlex.join(PARTLY_SEEN_OF)}",), "", of_partly_seen, {})
     )
+    command = f"{COVERAGE_COST} --json {shlex.join(RECORDINGS.values())}"
+    found.append(Measurement("coverage cost", (command,), "", of_coverage_cost, {}))
     found.append(Measurement("oracle", (f"{ORACLE} --json {shlex.join(ORACLED)}",), "", of_oracle, {}))
     for (method, limits), samples in sorted(SAMPLES.items(), key=lambda item: item[1]):
         command = f"tests.tools.soundness --json --samples {samples} --method {method} --limits {limits}"

@@ -16,16 +16,19 @@ from hrcreplay.cli.app import app
 from hrcreplay.commands import replay, report
 from hrcreplay.store import run_folder
 from hrcreplay.store.run_folder import Run
-from tests.tools import oracle, partly_seen
+from tests.tools import coverage_cost, oracle, partly_seen
 from tests.tools.readme import __main__ as readme
 from tests.tools.readme.blocks import BLOCK, BLOCKS, fill
 from tests.tools.readme.measurements import (
     BASELINES,
     COMPARED,
+    COST_FACTORS,
+    COST_HORIZONS,
     DEMO,
     HORIZONS_MS,
     ORACLED,
     PARTLY_SEEN_OF,
+    RECORDINGS,
     ROOT,
     VARIANTS,
     Measurement,
@@ -97,6 +100,8 @@ def test_the_commands_parse(measurement: Measurement) -> None:
             assert oracle.parser().parse_args(words).names == [*ORACLED]
         elif module == "tests.tools.partly_seen":
             assert partly_seen.parser().parse_args(words).names == [*PARTLY_SEEN_OF]
+        elif module == "tests.tools.coverage_cost":
+            assert coverage_cost.parser().parse_args(words).names == [*RECORDINGS.values()]
         else:
             assert module == "tests.tools.soundness"
             soundness._parser().parse_args(words)
@@ -107,7 +112,7 @@ def _made_up() -> dict[str, Any]:
     numbers = iter(np.linspace(0.1, 0.9, 2000).tolist())
     facts: dict[str, Any] = {}
     for measurement in measurements():
-        kinds = {"compare": _compared, "oracle": _oracled, "partly seen": _partly_seen}
+        kinds = {"compare": _compared, "oracle": _oracled, "partly seen": _partly_seen, "coverage cost": _cost}
         made = kinds.get(measurement.name, _Numbers)
         found = measurement.keep(made(numbers))
         facts[measurement.name] = {"figures": dict(found)}
@@ -125,8 +130,15 @@ def _oracled(numbers: Any) -> dict[str, Any]:
 
 def _partly_seen(numbers: Any) -> dict[str, Any]:
     each = [f"{when}_{what}" for when in ("just", "long") for what in ("partly", "whole")]
-    keys = [f"{one}_{what}" for one in each for what in ("held", "m3")]
+    keys = [*(f"{one}_{what}" for one in each for what in ("held", "m3")), "long_slow_m3"]
     return {name: {key: next(numbers) for key in keys} for name in PARTLY_SEEN_OF}
+
+
+def _cost(numbers: Any) -> dict[str, Any]:
+    keys = ("shares", "union_m3")
+    return {
+        f"{factor:g}": {key: [next(numbers) for _ in range(COST_HORIZONS)] for key in keys} for factor in COST_FACTORS
+    }
 
 
 AUDIT_KEYS = [
