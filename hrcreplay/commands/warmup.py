@@ -19,7 +19,7 @@ from hrcreplay.commands import replay
 from hrcreplay.geometry.convex_hull import visible_front
 from hrcreplay.geometry.distances import farthest_at_most
 from hrcreplay.geometry.inflated_hull import InflatedHull
-from hrcreplay.geometry.polyline import advance_foot, follow_nearer
+from hrcreplay.geometry.polyline import advance_foot, follow_nearer, nearest_vertices
 from hrcreplay.geometry.small_matrices import multiply
 from hrcreplay.human.fusion.fuse import MEDIAN_LENGTHS_M
 from hrcreplay.human.model import skeleton
@@ -77,6 +77,7 @@ def _compile_rest(states: HumanStates) -> None:
     turn, pixels_m = np.eye(3)[:, :2].copy(), np.linspace(-1.0, 1.0, 4)
     for corners_m in (np.asfortranarray(hull.vertices_m), np.ones((4, 6))[:, ::2]):  # of tables
         multiply(corners_m, turn)
+    nearest_vertices(np.ones((2, 3)), np.eye(3))
     follow_nearer(np.ones((2, 3)), np.eye(3), np.zeros(2, np.int64))
     advance_foot(np.ones((2, 3)), np.eye(3), np.arange(3.0), np.arange(2), 1.0, 0.1)
     visible_front(hull.vertices_m[hull.faces], np.ones(len(hull.faces)), pixels_m, pixels_m)

@@ -7,6 +7,51 @@ import numpy as np
 from hrcreplay.kernels import njit
 from hrcreplay.records import Floats, Ints
 
+#: Number of consecutive vertices in a block, and of blocks in a group.
+_BLOCK, _BLOCKS = 32, 16
+#: Rounding of a distance [m].
+_ROUNDING_M = 1e-9
+
+
+@njit(cache=True)
+def nearest_vertices(points: Floats, vertices: Floats) -> Ints:
+    """Returns (n,) which of some vertices (m, 3) are nearest to (n, 3) points [m].
+
+    The points are those of a motion: the vertex nearest to one is near to the next one, too. So only few blocks of
+    vertices can hold a nearer one, by the balls around them, and around groups of them. Vertices that follow one
+    another should be neighbours.
+    """
+    blocks, groups = _balls(vertices, _BLOCK), _balls(vertices, _BLOCK * _BLOCKS)
+    found, nearest = np.empty(len(points), np.int64), 0
+    for i in range(len(points)):
+        least2 = _apart2(points, i, vertices, nearest)
+        for g in range(len(groups)):
+            if _apart2(points, i, groups, g) > (np.sqrt(least2) + groups[g, 3]) ** 2:
+                continue
+            for b in range(g * _BLOCKS, min((g + 1) * _BLOCKS, len(blocks))):
+                if _apart2(points, i, blocks, b) > (np.sqrt(least2) + blocks[b, 3]) ** 2:
+                    continue
+                for k in range(b * _BLOCK, min((b + 1) * _BLOCK, len(vertices))):
+                    apart2 = _apart2(points, i, vertices, k)
+                    if apart2 < least2:
+                        nearest, least2 = k, apart2
+        found[i] = nearest
+    return found
+
+
+@njit(cache=True, inner=True)
+def _balls(vertices: Floats, size: int) -> Floats:
+    """Balls around each ``size`` consecutive vertices: (k, 4) their middles, and their radii rounded up [m]."""
+    found = np.zeros(((len(vertices) + size - 1) // size, 4))
+    for b in range(len(found)):
+        part = vertices[b * size : (b + 1) * size]
+        for axis in range(3):
+            found[b, axis] = 0.5 * (part[:, axis].min() + part[:, axis].max())
+        for k in range(len(part)):
+            found[b, 3] = max(found[b, 3], np.sqrt(_apart2(found, b, part, k)))
+        found[b, 3] += _ROUNDING_M
+    return found
+
 
 @njit(cache=True)
 def follow_nearer(points: Floats, path: Floats, at: Ints) -> None:

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hrcreplay.geometry.polyline import advance_foot, follow_nearer
+from hrcreplay.geometry.polyline import advance_foot, follow_nearer, nearest_vertices
 from hrcreplay.records import Floats, Ints
 
 
@@ -21,6 +21,16 @@ def test_it_goes_on_to_the_first_vertex_from_which_both_neighbours_are_farther()
                 way += step
         assert last == way
     assert (at != start).mean() > 0.3
+
+
+@pytest.mark.parametrize("count", [1, 31, 33, 700, 2000])
+def test_the_nearest_vertex_is_that_of_all(count: int) -> None:
+    """Points that jump about and points that move little, near the vertices and far from them."""
+    rng = np.random.default_rng(count)
+    vertices = np.cumsum(rng.normal(size=(count, 3)), axis=0)
+    points = np.concatenate([30.0 * rng.normal(size=(200, 3)), np.cumsum(0.1 * rng.normal(size=(200, 3)), axis=0)])
+    apart = np.linalg.norm(vertices[None] - points[:, None], axis=2)
+    assert np.array_equal(nearest_vertices(points, vertices), apart.argmin(axis=1))
 
 
 def test_along_a_line_it_finds_the_nearest_vertex() -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from hrcreplay.geometry.polyline import follow_nearer
+from hrcreplay.geometry.polyline import follow_nearer, nearest_vertices
 from hrcreplay.human.model import nearest
 from hrcreplay.records import JOINTS, Bools, Floats, Ints, find_neighbours
 from hrcreplay.store.run_folder import Run
@@ -175,8 +175,6 @@ def thin_stretches(points: Floats, tolerance: float) -> list[Floats]:
 #: Edge of the cells in which vertices of a path are searched together, and distance below which vertices are merged
 #: [m].
 _CELL_M, _SAME_M = 2e-4, 1e-6
-#: Vertices in each leaf of their tree: more than usual, as a point far from the path is near to many of them.
-_LEAF = 64
 
 
 def path_feet(points: Floats, path: Floats) -> Floats:
@@ -208,15 +206,16 @@ def path_feet(points: Floats, path: Floats) -> Floats:
 def _nearest_vertices(points: Floats, path: Floats) -> Ints:
     """Returns (n,) indices of the vertices of a (m, 3) path nearest to (n, 3) points.
 
-    A programme passes the same places in each cycle, and a tree of all these vertices is slow: only one vertex per cell
-    is tested, and from there the search follows the path while the distance decreases.
+    A programme passes the same places in each cycle: only one vertex per cell is tested, and from there the search
+    follows the path while the distance decreases.
     """
     cells = np.floor(path / _CELL_M).astype(np.int64)
     cells -= cells.min(axis=0)
     _, first = np.unique(np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1)), return_index=True)
-    vertices = np.sort(first)
-    found: Ints = vertices[cKDTree(path[vertices], leafsize=_LEAF).query(points)[1]].astype(np.int64)
-    follow_nearer(np.ascontiguousarray(points), np.ascontiguousarray(path), found)
+    vertices = first[cKDTree(path[first]).indices]  # neighbours in space come one after the other
+    points, path = np.ascontiguousarray(points), np.ascontiguousarray(path)
+    found: Ints = vertices[nearest_vertices(points, path[vertices])]
+    follow_nearer(points, path, found)
     return found
 
 
