@@ -139,21 +139,22 @@ def write_contact(
     people = read_recorded_people(run_config, log, writer, seen)
     judged = _JudgedRun(run_config, T_world_base, people, writer.partial)
     paths = sorted(writer.partial.glob("motion*.parquet"))
-    full, there = judged.full, {}
+    coverages, there = judged.coverages, {}
     if second is not None:
         second.submit(_take_there, judged)
-        full = second.submit(_full_there).result
+        coverages = second.submit(_coverages_there).result
         every_other = [path for path in paths[1:] if path.stem != f"motion_{RECORDED}"][::2]
         there = {path: second.submit(_tables_there, path) for path in every_other}
     found: dict[Path, tuple[Columns, Columns]] = {}
-    for path in [path for path in paths if path not in there]:
+    here = [path for path in paths if path not in there]
+    for path in sorted(here, key=lambda path: path.stem == "motion"):  # last, as it needs both coverages
         motion, capsules = StoredTable(path), None
         if path.stem == "motion":
             shown_ns = motion["t_ns"].to_numpy()[:: max(1, round(run_config.settings.fusion.rate_hz / _BODY_HZ))]
             writer.table("body", body_table(people, shown_ns, run_config.settings.prediction.hand_m))
         if path.stem == f"motion_{RECORDED}" and motion["q1"].isna().all():
             capsules, _ = assembly.recorded_capsules(log, T_world_base)
-        found[path] = judged.tables(path, capsules, full)
+        found[path] = judged.tables(path, capsules, coverages)
     for path in paths:
         rows, meetings = found.pop(path) if path in found else there.pop(path).result()
         writer.table("contact", rows)
@@ -186,27 +187,30 @@ class _JudgedRun:
         """Volumes of any tick."""
         return Predicted(assembly.prediction_stage(self.run_config), self.folder / "state.parquet")
 
-    def full(self) -> Coverages:
-        """Coverage by the volumes until the braking time."""
-        return compute_full_coverage(self.run_config, self.people, self.predicted)
+    def coverages(self) -> tuple[Coverages, Coverages]:
+        """Coverage by the volumes that the chosen method used, and by those until the braking time."""
+        run = self.run_config, self.people, self.predicted
+        return compute_own_coverage(*run, StoredTable(self.folder / "motion.parquet")), compute_full_coverage(*run)
 
     def tables(
-        self, path: Path, capsules: RecordedCapsules | None = None, full: Callable[[], Coverages] | None = None
+        self,
+        path: Path,
+        capsules: RecordedCapsules | None = None,
+        coverages: Callable[[], tuple[Coverages, Coverages]] | None = None,
     ) -> tuple[Columns, Columns]:
         """Computes the rows of contact and of severity of a motion.
 
         Args:
             path: Table of the motion; that of the chosen method is judged by the volumes, too.
             capsules: The robot as recorded by its capsules; None: no such robot.
-            full: Gives ``full()``, for the chosen method.
+            coverages: Gives ``coverages()``, for the chosen method.
         """
         run_config, people = self.run_config, self.people
         method = path.stem.removeprefix("motion").removeprefix("_") or run_config.settings.plan.method
-        motion, own, until = StoredTable(path), None, None
+        motion, own, full = StoredTable(path), None, None
         if path.stem == "motion":
-            own = compute_own_coverage(run_config, people, self.predicted, motion)
-            until = (full or self.full)()
-        rows = contact_table(run_config, self.robot, method, motion, people, self.predicted, own, until, capsules)
+            own, full = (coverages or self.coverages)()
+        rows = contact_table(run_config, self.robot, method, motion, people, self.predicted, own, full, capsules)
         meetings = arrow_table({name: rows[name] for name in MET}).to_pandas()
         return rows, severity_table(run_config, self.robot, method, motion, meetings, people, capsules)
 
@@ -219,8 +223,8 @@ def _take_there(judged: _JudgedRun) -> None:
     _THERE[:] = [judged]
 
 
-def _full_there() -> Coverages:
-    return _THERE[0].full()
+def _coverages_there() -> tuple[Coverages, Coverages]:
+    return _THERE[0].coverages()
 
 
 def _tables_there(path: Path) -> tuple[Columns, Columns]:

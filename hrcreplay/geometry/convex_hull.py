@@ -91,7 +91,8 @@ def above(points_m: Floats, triangles: Ints, height_m: float) -> tuple[Floats, I
         triangles: (f, 3) of its surface, in any order.
         height_m: The part below this height is removed [m].
     """
-    a, b = points_m[np.unique(np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)), axis=0).T]
+    ends = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2))
+    a, b = points_m[np.array(np.divmod(np.unique(ends[:, 0] * len(points_m) + ends[:, 1]), len(points_m)))]
     low, high = a[:, 2:] - height_m, b[:, 2:] - height_m
     passes = (low * high < 0.0)[:, 0]
     low, high = low[passes], high[passes]

@@ -25,7 +25,18 @@ from hrcreplay.records import JOINTS, LENGTHS, Floats
 from hrcreplay.reporting import scene_messages as parts
 from hrcreplay.reporting.metrics.series import thin_stretches, times
 from hrcreplay.reporting.replay_scene import LinkMesh, MethodTrack, ReplayScene, at_rate, placements, pose_links
-from hrcreplay.reporting.scene_messages import ROBOT, WORLD, Rgba, bones, capsule, entity, lines, surface, timestamp
+from hrcreplay.reporting.scene_messages import (
+    ROBOT,
+    WORLD,
+    Rgba,
+    bones,
+    capsule,
+    capsules,
+    entity,
+    lines,
+    surface,
+    timestamp,
+)
 
 #: Maximum rate of volumes [Hz].
 _VOLUME_HZ = 5.0
@@ -300,13 +311,6 @@ def _transforms(scene: ReplayScene) -> Iterator[Message]:
         )
 
 
-def _capsules(ends_m: Floats, radius_m: Floats, rgba: Rgba) -> dict[str, Any]:
-    """Returns the primitives of the known ones of some capsules, (n, 2, 3) and (n,) [m]."""
-    known = np.flatnonzero(np.isfinite(ends_m).all(axis=(1, 2))).tolist()
-    each = [capsule(ends_m[k], float(radius_m[k]), rgba) for k in known]
-    return {kind: [shape for one in each for shape in one[kind]] for kind in ("spheres", "cylinders")}
-
-
 def _person(scene: ReplayScene) -> Iterator[Message]:
     """Yields the fused skeletons, their points, and the recorded bodies as capsules."""
     fields = [
@@ -330,7 +334,7 @@ def _person(scene: ReplayScene) -> Iterator[Message]:
         )
         yield "/person/points", t_ns, cloud
         bodies = [
-            entity(t_ns, f"recorded{name}", **_capsules(body[i, of_one], scene.body_radius_m[of_one], _BODY))
+            entity(t_ns, f"recorded{name}", **capsules(body[i, of_one], scene.body_radius_m[of_one], _BODY))
             for name, of_one in zip(names, owned, strict=True)
         ]
         yield "/person/recorded", t_ns, messages.SceneUpdate(entities=bodies)

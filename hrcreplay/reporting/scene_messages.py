@@ -88,18 +88,40 @@ def bones(points_m: Floats, rgba: Rgba = PERSON) -> Any:
 
 def capsule(ends_m: Floats, radius_m: float, rgba: Rgba) -> dict[str, Any]:
     """Makes the primitives of a capsule between two points, (2, 3) [m]."""
-    a, b = ends_m
-    size = 2.0 * radius_m
-    ball = messages.Vector3(x=size, y=size, z=size)
-    rod = messages.CylinderPrimitive(
-        pose=pose((a + b) / 2.0, upright_to(b - a)),
-        size=messages.Vector3(x=size, y=size, z=float(np.linalg.norm(b - a))),
-        bottom_scale=1.0,
-        top_scale=1.0,
-        color=colour(rgba),
-    )
-    balls = [messages.SpherePrimitive(pose=pose(end), size=ball, color=colour(rgba)) for end in (a, b)]
-    return {"spheres": balls, "cylinders": [rod]}
+    return capsules(ends_m[None], np.array([radius_m]), rgba)
+
+
+def capsules(ends_m: Floats, radius_m: Floats, rgba: Rgba) -> dict[str, Any]:
+    """Makes the primitives of the known ones of some capsules, (n, 2, 3) and (n,) [m]."""
+    known = np.isfinite(ends_m).all(axis=(1, 2))
+    ends_m, wide_m, one_colour = ends_m[known], (2.0 * radius_m[known]).tolist(), colour(rgba)
+    along, level = ends_m[:, 1] - ends_m[:, 0], messages.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
+    length_m = np.sqrt([one.dot(one) for one in along])
+    balls = [
+        messages.SpherePrimitive(
+            pose=messages.Pose(position=messages.Vector3(x=x, y=y, z=z), orientation=level),
+            size=messages.Vector3(x=size, y=size, z=size),
+            color=one_colour,
+        )
+        for size, ends in zip(wide_m, ends_m.tolist(), strict=True)
+        for x, y, z in ends
+    ]
+    middles = ((ends_m[:, 0] + ends_m[:, 1]) / 2.0).tolist()
+    rods = [
+        messages.CylinderPrimitive(
+            pose=messages.Pose(
+                position=messages.Vector3(x=x, y=y, z=z), orientation=messages.Quaternion(x=qx, y=qy, z=qz, w=qw)
+            ),
+            size=messages.Vector3(x=size, y=size, z=long),
+            bottom_scale=1.0,
+            top_scale=1.0,
+            color=one_colour,
+        )
+        for size, long, (x, y, z), (qx, qy, qz, qw) in zip(
+            wide_m, length_m.tolist(), middles, upright_to(along, length_m).tolist(), strict=True
+        )
+    ]
+    return {"spheres": balls, "cylinders": rods}
 
 
 def surface(vertices_m: Floats, radius_m: float, rgba: Rgba = VOLUME) -> Any:
@@ -144,13 +166,17 @@ def _around_a_ball() -> tuple[Floats, Ints]:
     return unit, triangles
 
 
-def upright_to(direction: Floats) -> tuple[float, float, float, float]:
-    """Returns the quaternion (x, y, z, w) that turns the z axis into a direction; the identity for a zero direction."""
-    length = float(np.linalg.norm(direction))
-    if length == 0.0:
-        return 0.0, 0.0, 0.0, 1.0
-    x, y, z = (direction / length).tolist()
-    if z < -1.0 + 1e-12:
-        return 1.0, 0.0, 0.0, 0.0
-    w = np.sqrt(0.5 * (1.0 + z))
-    return -y / (2.0 * w), x / (2.0 * w), 0.0, float(w)
+def upright_to(directions: Floats, lengths: Floats) -> Floats:
+    """Returns the quaternions (n, 4), x y z w, that turn the z axis into directions (n, 3) of some lengths (n,).
+
+    The identity for a direction of length 0.
+    """
+    found = np.zeros((len(directions), 4))
+    found[:, 3] = 1.0
+    x, y, z = (directions / np.where(lengths > 0.0, lengths, 1.0)[:, None]).T
+    down = (lengths > 0.0) & (z < -1.0 + 1e-12)
+    found[down] = 1.0, 0.0, 0.0, 0.0
+    turned = (lengths > 0.0) & ~down
+    w = np.sqrt(0.5 * (1.0 + z[turned]))
+    found[turned, 0], found[turned, 1], found[turned, 3] = -y[turned] / (2.0 * w), x[turned] / (2.0 * w), w
+    return found

@@ -174,11 +174,12 @@ def _capsules(ends_m: Floats, radius_m: Floats, colour: tuple[int, ...]) -> Any:
 
 def _capsule_fields(ends_m: Floats, radius_m: Floats) -> dict[str, Any]:
     along = ends_m[:, 1] - ends_m[:, 0]
+    lengths_m = np.linalg.norm(along, axis=1)
     return {
-        "lengths": np.linalg.norm(along, axis=1),
+        "lengths": lengths_m,
         "radii": radius_m,
         "translations": ends_m[:, 0],
-        "quaternions": np.array([upright_to(one) for one in along]).reshape(-1, 4),
+        "quaternions": upright_to(along, lengths_m),
     }
 
 

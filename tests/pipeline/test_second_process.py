@@ -55,7 +55,7 @@ def test_two_processes_write_the_same_bytes_as_one(tmp_path: Path, monkeypatch: 
         assert {"plan none", "plan qp", "plan scaling"} <= set(json.loads((folder / "timing.json").read_text()))
     assert found[0] == found[1]
     assert {"contact.parquet", "severity.parquet", "motion_none.parquet", "motion_scaling.parquet"} <= set(found[0])
-    assert set(taken) == {"_start", "_take", "_finish", "_take_there", "_full_there", "_tables_there"} | {
+    assert set(taken) == {"_start", "_take", "_finish", "_take_there", "_coverages_there", "_tables_there"} | {
         "_forget_there",
         "_write_scene",
         "draw_there",

@@ -382,6 +382,18 @@ def observe(robot: RobotModel, state: RobotState, obstacles: Obstacles, clearanc
     pose, finite, found = look(robot.arm, state.q, state.dq, *hulls, obstacles.known, clearance_m)
     if not finite or not obstacles.known:
         return Sight(pose, None, math.nan, -1, -1, NO_HUMAN if finite else NOT_FINITE)
+    return _sight(pose, found, obstacles)
+
+
+def observe_people(robot: RobotModel, pose: RobotPose, obstacles: Obstacles, clearance_m: float) -> Sight:
+    """Nearest pair of link and limb of a robot whose pose is known; see ``observe``."""
+    if not obstacles.known:
+        return Sight(pose, None, math.nan, -1, -1, NO_HUMAN)
+    hulls = obstacles.vertices_m, obstacles.offsets, obstacles.radius_m
+    return _sight(pose, measure(pose.ends_m, robot.arm.radius_m, *hulls, clearance_m), obstacles)
+
+
+def _sight(pose: RobotPose, found: NearestLink, obstacles: Obstacles) -> Sight:
     pairs, surface, link, limb = found
     if not pairs.distance_m.size:
         return Sight(pose, pairs, math.nan, -1, -1, 0)

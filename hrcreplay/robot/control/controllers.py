@@ -29,6 +29,7 @@ from hrcreplay.robot.control.control_step import (
     make_step,
     motion_row,
     observe,
+    observe_people,
     standstill_reason,
 )
 from hrcreplay.robot.control.qp_controller import QpContext
@@ -197,8 +198,9 @@ class BlindController(PathController):
         """A batch of ticks: the motion first, as it ignores people, then the people of all ticks at once."""
         moved = [self.step(_nobody) for _ in range(ticks)]
         people = outlook.until(np.array([tick.step.horizon_s for tick in moved]))
+        clearance_m = self.settings.plan.clearance_m
         return [
-            tick._replace(step=tick.step.beside(observe(self.robot, tick.state, there, self.settings.plan.clearance_m)))
+            tick._replace(step=tick.step.beside(observe_people(self.robot, tick.step.pose, there, clearance_m)))
             for tick, there in zip(moved, people, strict=True)
         ]
 

@@ -97,11 +97,15 @@ def test_a_limb_that_is_not_known_has_no_mesh(vertices: Any) -> None:
     assert len(corners) == len(faces) == 0
 
 
-@pytest.mark.parametrize("direction", [(0, 0, 2.0), (0, 0, -1.0), (1.0, 0, 0), (0.3, -2.0, 0.7)])
-def test_the_quaternion_turns_z_into_the_direction(direction: tuple[float, float, float]) -> None:
-    x, y, z, w = upright_to(np.array(direction))
+def test_the_quaternions_turn_z_into_the_directions() -> None:
+    directions = np.array([(0, 0, 2.0), (0, 0, -1.0), (1.0, 0, 0), (0.3, -2.0, 0.7), (0, 0, 0)])
+    lengths = np.linalg.norm(directions, axis=1)
+    found = upright_to(directions, lengths)
+    x, y, z, w = found[:4].T
     turned = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
-    np.testing.assert_allclose(turned, np.array(direction) / np.linalg.norm(direction), atol=1e-12)
+    np.testing.assert_allclose(np.transpose(turned), directions[:4] / lengths[:4, None], atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1.0, atol=1e-12)
+    assert found[4].tolist() == [0.0, 0.0, 0.0, 1.0]
 
 
 # --- Foxglove, by a client written after the protocol's description ---
