@@ -66,8 +66,8 @@ MARGINS = {
 }
 #: Motions that are sampled for each method and limit set.
 SAMPLES = {
-    ("sound", "people"): 2_000_000,
-    ("sound", "paper"): 2_000_000,
+    ("sound", "people"): 10_000_000,
+    ("sound", "paper"): 10_000_000,
     ("paper", "people"): 200_000,
     ("paper", "paper"): 200_000,
     ("positions", "people"): 200_000,
