@@ -247,7 +247,7 @@ class Volumes:
         """Returns the columns of occupancy.parquet, one row per tick and known limb."""
         found = _MemoryTables()
         found.table("occupancy", occupancy_columns(np.zeros(0, np.int64), [], self.volumes.method, [], [], [], []))
-        stages.store_volumes(self.volumes, np.arange(len(self)), np.full(len(self), self.horizon_s), found)
+        stages.store_volumes([stages.StoredVolumes(self.volumes, self.horizon_s)], found)
         return found.tables["occupancy"].to_pandas()
 
 

@@ -144,6 +144,7 @@ def _mark(points: Floats, vertices: Floats, faces: Ints, radius: float, inside: 
         if not outside and len(faces):  # mostly the nearest triangle is the one that faces the point most
             apart2 = _triangle(point, vertices, faces, normals, facing, highest)
             inside[i] = outside = highest < -behind or apart2 <= radius * radius
+            outside = outside or _is_beyond(point, vertices, faces[facing], radius)
         if not outside:
             inside[i] = _distance(point, vertices, faces, normals, offsets, behind, radius) <= radius
 
@@ -207,6 +208,20 @@ def _triangle(p: Vector, vertices: Floats, faces: Ints, normals: Floats, f: int,
 
 
 @njit(cache=True, inner=True)
+def _is_beyond(p: Vector, vertices: Floats, triangle: Ints, radius: float) -> bool:
+    """Returns True if a plane square to the way from the nearest edge of a triangle to p is too far from the hull."""
+    away, apart2 = (0.0, 0.0, 0.0), np.inf
+    for k in range(3):
+        other = _from_segment(p, _corner(vertices, triangle[k]), _corner(vertices, triangle[(k + 1) % 3]))
+        if dot(other, other) < apart2:
+            away, apart2 = other, dot(other, other)
+    top = -np.inf
+    for v in range(len(vertices)):
+        top = max(top, dot(away, _corner(vertices, v)))
+    return dot(away, p) - top > radius * np.sqrt(apart2)
+
+
+@njit(cache=True, inner=True)
 def _left(p: Vector, a: Vector, b: Vector, normal: Vector) -> bool:
     """Returns True if p is on the inner side of the edge from a to b of a triangle with that normal."""
     ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
@@ -218,11 +233,17 @@ def _left(p: Vector, a: Vector, b: Vector, normal: Vector) -> bool:
 @njit(cache=True, inner=True)
 def _segment(p: Vector, a: Vector, b: Vector) -> float:
     """Squared distance of p from the segment a b, which may be a point."""
+    away = _from_segment(p, a, b)
+    return dot(away, away)
+
+
+@njit(cache=True, inner=True)
+def _from_segment(p: Vector, a: Vector, b: Vector) -> Vector:
+    """Vector to p from the nearest point of the segment a b, which may be a point."""
     ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     wx, wy, wz = p[0] - a[0], p[1] - a[1], p[2] - a[2]
     length = ux * ux + uy * uy + uz * uz
     t = 0.0
     if length > 0.0:
         t = max(0.0, min((ux * wx + uy * wy + uz * wz) / length, 1.0))
-    x, y, z = wx - t * ux, wy - t * uy, wz - t * uz
-    return x * x + y * y + z * z
+    return wx - t * ux, wy - t * uy, wz - t * uz

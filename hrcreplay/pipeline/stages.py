@@ -6,6 +6,7 @@ import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import product
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -441,18 +442,17 @@ def select_stored_ticks(first: int, count: int, store_every: float) -> Ints:
     return np.flatnonzero(np.floor(number / store_every) != np.floor((number - 1) / store_every))
 
 
-def store_volumes(
-    volumes: SweptVolumes, rows: Ints, horizon_s: Floats, tables: Tables, person: Ints | None = None
-) -> None:
-    """Writes hull vertices and volume above the floor for some rows; a row without a person has none.
+class StoredVolumes(NamedTuple):
+    """Volumes that are stored."""
 
-    Args:
-        volumes: Of any rows.
-        rows: Rows of ``volumes`` to write.
-        horizon_s: (n,) time after its tick until which each row holds [s].
-        tables: Receives the rows.
-        person: (n,) number of each row's person; None: person 1.
-    """
+    volumes: SweptVolumes  #: of any rows
+    horizon_s: float  #: time after its tick until which each row holds [s]
+    person: Ints | None = None  #: (n,) number of each row's person; None: person 1
+    rows: Ints | None = None  #: rows to store; None: all
+
+
+def store_volumes(parts: Iterable[StoredVolumes], tables: Tables) -> None:
+    """Writes hull vertices and volume above the floor; a row without a person has none."""
     t_ns: list[int] = []
     limbs: list[str] = []
     radii: list[float] = []
@@ -460,8 +460,11 @@ def store_volumes(
     hulls: list[Floats] = []
     horizons: list[float] = []
     people: list[int] = []
-    for row in rows.tolist():
-        for i, limb in enumerate(volumes.limbs):
+    method, numbered = "", False
+    for volumes, horizon_s, person, rows in parts:
+        method, numbered = volumes.method, person is not None
+        chosen = range(len(volumes)) if rows is None else rows.tolist()
+        for row, (i, limb) in product(chosen, enumerate(volumes.limbs)):
             vertices = volumes.vertices(row, i)
             if np.isnan(vertices).any():
                 continue
@@ -471,11 +474,11 @@ def store_volumes(
             radii.append(solid.radius_m)
             sizes.append(solid.volume_above_m3(FLOOR_Z_M))
             hulls.append(solid.vertices_m)
-            horizons.append(float(horizon_s[row]))
+            horizons.append(horizon_s)
             people.append(1 if person is None else int(person[row]))
     if t_ns:
-        columns = occupancy_columns(np.array(t_ns), limbs, volumes.method, radii, sizes, hulls, horizons)
-        tables.table("occupancy", columns if person is None else with_person(columns, np.array(people)))
+        columns = occupancy_columns(np.array(t_ns), limbs, method, radii, sizes, hulls, horizons)
+        tables.table("occupancy", with_person(columns, np.array(people)) if numbered else columns)
 
 
 def predict_batches(
@@ -497,8 +500,7 @@ def predict_batches(
             volumes = prediction_stage.volumes(batch)
         rows = np.concatenate([np.arange(first[tick], first[tick + 1]) for tick in stored] or [stored])
         with sink.watch.stage("hulls", len(ticks)):
-            horizon_s = np.full(len(batch), prediction_stage.horizon_s)
-            store_volumes(volumes, rows, horizon_s, sink.tables, batch.person)
+            store_volumes([StoredVolumes(volumes, prediction_stage.horizon_s, batch.person, rows)], sink.tables)
         done += len(ticks)
         sink.progress("predict", len(ticks))
         yield batch
@@ -581,13 +583,15 @@ def store_stored_ticks(forecast: Forecast, stored: Ints, horizon_s: Floats, sink
         sink: Receives rows and times.
     """
     person = forecast.states.person
+
+    def volumes(tick: int, until_s: float) -> StoredVolumes:
+        rows = forecast.rows(tick)
+        found = forecast.person.volumes(until_s, rows.start, rows.stop)
+        return StoredVolumes(found, until_s, None if person is None else person[rows])
+
     with sink.watch.stage("hulls", len(forecast.t_ns)):
-        for tick, until_s in zip(stored.tolist(), horizon_s.tolist(), strict=True):
-            rows = forecast.rows(tick)
-            volumes = forecast.person.volumes(until_s, rows.start, rows.stop)
-            there = np.arange(len(volumes))
-            numbers = None if person is None else person[rows]
-            store_volumes(volumes, there, np.full(len(there), until_s), sink.tables, numbers)
+        each = zip(stored.tolist(), horizon_s.tolist(), strict=True)
+        store_volumes((volumes(tick, until_s) for tick, until_s in each), sink.tables)
 
 
 def nearest_columns(robot: RobotModel, static: StaticObstacles | None, motion: Motion) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from hrcreplay.logs.reader import open_log
 from hrcreplay.pipeline import assembly
 from hrcreplay.pipeline.person_fuser import PersonFuser
 from hrcreplay.pipeline.run_config import RunConfig
-from hrcreplay.pipeline.stages import PeopleChecks, batches, nearest_columns, store_volumes
+from hrcreplay.pipeline.stages import PeopleChecks, StoredVolumes, batches, nearest_columns, store_volumes
 from hrcreplay.records import BODY, DOF, LENGTHS, POINTS, HumanStates, Ints, Motion, volume_name
 from hrcreplay.robot.control.static_obstacles import StaticObstacles
 from hrcreplay.robot.model import RobotModel
@@ -86,9 +86,8 @@ class SessionTables:
         self._looks, self._answers = [], []
 
     def _store(self, recorded: codec.RecordedVolumes) -> None:
-        count = len(recorded.people)
-        horizon_s = np.full(count, recorded.horizon_s)
-        store_volumes(recorded.volumes, np.arange(count), horizon_s, self.run, _persons(recorded.people))
+        person = _persons(recorded.people)
+        store_volumes([StoredVolumes(recorded.volumes, recorded.horizon_s, person)], self.run)
 
     def _motion(self) -> tuple[Motion, Columns]:
         """The motion of the answers, and the columns that only a live session has."""
