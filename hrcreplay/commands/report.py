@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,6 +19,7 @@ from hrcreplay.logs.reader import Log
 from hrcreplay.pipeline import assembly
 from hrcreplay.pipeline.progress import NO_PROGRESS, Progress
 from hrcreplay.pipeline.run_config import RunConfig, read_run_config
+from hrcreplay.pipeline.second_process import share
 from hrcreplay.records import Floats
 from hrcreplay.reporting import tables
 from hrcreplay.reporting.figures import catalogue, drawing
@@ -84,7 +85,8 @@ def write_report(
     kinds = catalogue.select_figures(run, found)
     here = None if elsewhere is not None else writer.partial / "scene.mcap"
     replay = _make_replay(run_config, everybody, here)  # before the figures: meanwhile the second process draws some
-    _draw_figures(run_config, everybody, found, kinds, folder, progress=progress, second=second)
+    drawn_there = None if second is None or elsewhere is None else (second, elsewhere)
+    _draw_figures(run_config, everybody, found, kinds, folder, progress=progress, second=drawn_there)
     progress.begin("page")
     shown = [
         tables.limit_table(run_config.prediction_limits, use="prediction"),
@@ -141,7 +143,7 @@ def _draw_figures(
     *,
     pdf: bool = False,
     progress: Progress = NO_PROGRESS,
-    second: Executor | None = None,
+    second: tuple[Executor, Future[Any]] | None = None,
 ) -> list[str]:
     """Draws figures of a run with all its people; those of one person for each, where they are made for that.
 
@@ -153,56 +155,47 @@ def _draw_figures(
         folder: Folder for the files.
         pdf: True: also as PDF.
         progress: Receives the progress.
-        second: A second process, which draws the last ones until it meets this one; None: no such process.
+        second: A second process and what it does before it draws the last ones; None: no such process.
 
     Returns:
         The names drawn.
     """
-    tasks = []
+    drawings = []
     for number in everybody.people:
-        names = [kind.name for kind in kinds if number == everybody.people[0] or kind.each]
-        few = [tuple(names[first : first + _FEW]) for first in range(0, len(names), _FEW)]
-        tasks += [_Drawing(run_config, folder, some, number, pdf) for some in few]
-    there: dict[_Drawing, Future[tuple[str, ...]]] = {}
-    if second is not None:
-        given = everybody.folder, json.dumps(everybody.meta), metrics
-        there = {task: second.submit(task.draw_there, *given) for task in tasks[:0:-1]}
-    drawn: list[str] = []
-    progress.begin("figures", sum(len(task.names) for task in tasks))
-    for task in tasks:
-        if task not in there or there[task].cancel():
-            drawn += task.draw(everybody, metrics, lambda: progress.advance("figures"))
-        else:
-            found = there[task].result()
-            progress.advance("figures", len(found))
-            drawn += found
-    return drawn
+        shown = [kind for kind in kinds if number == everybody.people[0] or kind.each]
+        drawings += [_Drawing(run_config, folder, kind.name, number, pdf) for kind in shown]
+    progress.begin("figures", len(drawings))
+
+    def here(task: _Drawing) -> tuple[str, ...]:
+        drawn = task.draw(everybody, metrics)
+        progress.advance("figures")
+        return drawn
+
+    if second is None:
+        return [name for task in drawings for name in here(task)]
+    (pool, busy), run, meta = second, everybody.folder, json.dumps(everybody.meta)
+    drawn = share(drawings, here, lambda task: pool.submit(task.draw_there, run, meta, metrics), busy)
+    return [name for names in drawn for name in names]
 
 
-#: Figures that one process draws at a time.
-_FEW = 3
-
-
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class _Drawing:
-    """Some figures of one person to draw, in either process."""
+    """A figure of one person to draw, in either process."""
 
     run_config: RunConfig
     folder: Path  #: for the files
-    names: tuple[str, ...]  #: of the kinds of figures
+    name: str  #: of the kind of figure
     number: int  #: the person
     pdf: bool  #: True: also as PDF
 
-    def draw(
-        self, everybody: Run, metrics: Mapping[str, Metric], drawn_one: Callable[[], None] = lambda: None
-    ) -> tuple[str, ...]:
-        """Draws them; returns the names drawn."""
-        kinds = [kind for kind in catalogue.FIGURES if kind.name in self.names]
+    def draw(self, everybody: Run, metrics: Mapping[str, Metric]) -> tuple[str, ...]:
+        """Draws it; returns its name, or nothing if the run lacks what is computed for it."""
+        kinds = [kind for kind in catalogue.FIGURES if kind.name == self.name]
         data = figure_data(self.run_config, everybody, metrics, kinds, self.number)
-        return catalogue.draw_all(data, self.folder, kinds, self.number, pdf=self.pdf, drawn=drawn_one)
+        return catalogue.draw_all(data, self.folder, kinds, self.number, pdf=self.pdf)
 
     def draw_there(self, run: Path, meta: str, metrics: Mapping[str, Metric]) -> tuple[str, ...]:
-        """Draws them in the second process."""
+        """Draws it in the second process."""
         return self.draw(_tables(run, meta), metrics)
 
 

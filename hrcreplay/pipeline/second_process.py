@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import multiprocessing
 import signal
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
+from threading import Lock
+from typing import Any, TypeVar
 
 #: Least number of ticks of a run with a second process, which takes seconds to start.
 MANY = 5000
+
+
+_T = TypeVar("_T")
+_R = TypeVar("_R")
 
 
 @contextmanager
@@ -24,3 +31,43 @@ def second_process() -> Iterator[ProcessPoolExecutor]:
                 process.terminate()
             pool.shutdown(cancel_futures=True)
             raise
+
+
+def share(
+    tasks: Sequence[_T], here: Callable[[_T], _R], there: Callable[[_T], Future[_R]], busy: Future[Any]
+) -> list[_R]:
+    """Does tasks in both processes: here from the first one on, there from the last one on, until they meet.
+
+    The second process gets one task at a time, as those in its queue cannot be taken back.
+
+    Args:
+        tasks: The tasks.
+        here: Does a task in this process.
+        there: Sends a task to the second process.
+        busy: What the second process does before.
+
+    Returns:
+        The results, in the order of the tasks.
+    """
+    left, lock, sent, done = deque(range(len(tasks))), Lock(), dict[int, Future[_R]](), dict[int, _R]()
+
+    def send(_before: Future[Any]) -> None:
+        with lock:
+            if not left:
+                return
+            last = left.pop()
+            sent[last] = there(tasks[last])
+        sent[last].add_done_callback(send)
+
+    busy.add_done_callback(send)
+    try:
+        while True:
+            with lock:
+                if not left:
+                    break
+                first = left.popleft()
+            done[first] = here(tasks[first])
+    finally:
+        with lock:
+            left.clear()
+    return [done[k] if k in done else sent[k].result() for k in range(len(tasks))]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import time
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +12,7 @@ import pytest
 
 from hrcreplay.commands import replay
 from hrcreplay.pipeline.run_config import resolve
-from hrcreplay.pipeline.second_process import second_process
+from hrcreplay.pipeline.second_process import second_process, share
 
 
 def _fail() -> None:
@@ -60,6 +62,64 @@ def test_two_processes_write_the_same_bytes_as_one(tmp_path: Path, monkeypatch: 
         "_write_scene",
         "draw_there",
     }
+
+
+def test_two_processes_share_tasks_until_they_meet() -> None:
+    """The second one has at most one task at a time, begins after what it does before, and takes the last ones."""
+    here: list[int] = []
+    there: list[int] = []
+    waiting: list[int] = []
+
+    def work(task: int) -> str:
+        time.sleep(0.01)
+        there.append(task)
+        return str(task)
+
+    def send(task: int) -> Future[str]:
+        waiting.append(task)
+        assert len(waiting) <= len(there) + 1
+        return pool.submit(work, task)
+
+    def do(task: int) -> str:
+        if task == 3:
+            busy.set_result(None)
+        assert task < 3 or waiting
+        time.sleep(0.01)
+        here.append(task)
+        return str(task)
+
+    busy: Future[None] = Future()
+    with ThreadPoolExecutor(1) as pool:
+        assert share(range(40), do, send, busy) == [str(task) for task in range(40)]
+    assert sorted(here + there) == list(range(40))
+    assert here == list(range(len(here)))
+    assert there == list(range(39, len(here) - 1, -1))
+    assert len(there) > 5
+
+
+def test_nothing_is_sent_after_an_error_here() -> None:
+    busy: Future[None] = Future()
+    sent: list[int] = []
+
+    def do(task: int) -> None:
+        if task == 2:
+            raise LookupError("as it does")
+
+    def send(task: int) -> Future[None]:
+        sent.append(task)
+        return Future()
+
+    with pytest.raises(LookupError, match="as it does"):
+        share(range(9), do, send, busy)
+    busy.set_result(None)
+    assert not sent
+
+
+def test_an_error_there_is_raised_here() -> None:
+    busy: Future[None] = Future()
+    busy.set_result(None)
+    with ThreadPoolExecutor(1) as pool, pytest.raises(LookupError, match="as it does"):
+        share(range(2), lambda _: time.sleep(0.01), lambda _: pool.submit(_fail), busy)
 
 
 def test_an_error_of_the_second_process_is_that_of_the_run() -> None:

@@ -375,7 +375,6 @@ def draw_all(
     number: int = 1,
     *,
     pdf: bool = False,
-    drawn: Callable[[], None] = lambda: None,
 ) -> tuple[str, ...]:
     """Draws figures into ``folder`` as ``<name>.png`` and ``<name>.svg``, and ``<name>.pdf`` if asked to.
 
@@ -386,7 +385,6 @@ def draw_all(
             out.
         number: The person of ``data``.
         pdf: True: also as PDF.
-        drawn: Called after each figure.
 
     Returns:
         The names drawn.
@@ -399,7 +397,6 @@ def draw_all(
         with drawing.style(column=True):
             drawing.save(kind.draw(data), folder, file_name(kind, number), drawing.COLUMN_DPI, pdf=pdf)
         names.append(file_name(kind, number))
-        drawn()
     return tuple(names)
 
 
