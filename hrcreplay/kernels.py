@@ -23,6 +23,9 @@ from llvmlite import binding
 from numba.core import event
 from numba.core.caching import FunctionCache
 
+if "NUMBA_OPT" not in os.environ:  # compiles faster by a tenth than the highest level; the code is as fast
+    numba.config.OPT = type(numba.config.OPT)(2)
+
 #: The packages that contain kernels.
 ROOMS = ("audit", "calibration", "geometry", "human", "robot")
 

@@ -1,7 +1,7 @@
 """What each process of ``warmup`` runs so that the kernels of all commands are compiled.
 
 The robot does not wait for the fusion: it moves beside a person that is written down. So the two processes have about
-the same amount to compile.
+the same amount to compile. What both call is compiled by the one that comes to it first.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from hrcreplay.store.columns import read_states, state_columns
 from hrcreplay.store.run_folder import RunWriter, Stopwatch
 
 _SPAN: Any = {"start_s": 8.0, "end_s": 8.4}
+_METHODS: tuple[str, ...] = get_args(Plan.model_fields["method"].annotation)
 _SEARCH_S, _FRAMES = 0.01, 500  # of clock offsets
 #: Distance of the person from the robot's base at the first and the last tick [m].
 _FAR_M, _NEAR_M = 2.0, 0.3
@@ -47,13 +48,15 @@ def compile_part(part: str) -> None:
 
 
 def _compile_person(scratch: Path) -> None:
-    """Fusion and smoothing, the printed predictions, and the contact with the recorded person."""
+    """Fusion and smoothing, the printed predictions, and robots on their path beside the recorded person."""
     from hrcreplay.evaluation.contact import write_contact
 
-    fused = replay.run("fuse", replay.demo_log(), out=scratch / "fuse", smooth=True, **_SPAN)
+    how: Any = {"cell_file": replay.demo_cell(), **_SPAN}
+    fused = replay.run("fuse", replay.demo_log(), out=scratch / "fuse", smooth=True, **how)
     for method in swept_volumes.PRINTED:
         replay.run("predict", fused, out=scratch / method, overrides=(f"prediction.method={method}",))
-    run_config = resolve("plan", fused, overrides=("plan.method=none", "plan.baselines=[]"))
+    on_path = [name for name in _METHODS if name not in ("qp", "none")]
+    run_config = resolve("plan", fused, overrides=("plan.method=none", f"plan.baselines={on_path}"))
     moved = replay.execute(run_config, scratch / "none")
     states = next(read_states(fused / "state.parquet", 50))
     for method in swept_volumes.METHODS:
@@ -86,8 +89,7 @@ def _compile_rest(states: HumanStates) -> None:
 def _compile_robot(scratch: Path) -> None:
     """The prediction by default, and every controller beside a person who comes up to the robot."""
     compile_second_tries()
-    methods = get_args(Plan.model_fields["method"].annotation)
-    overrides = ("plan.method=qp", f"plan.baselines={[name for name in methods if name != 'qp']}")
+    overrides = ("plan.method=qp", f"plan.baselines={[name for name in _METHODS if name != 'qp']}")
     how: Any = {"cell_file": replay.demo_cell(), "overrides": overrides, **_SPAN}
     run_config = resolve("plan", replay.demo_log(), **how)
     log = open_log(run_config.log, run_config.settings.logs)
