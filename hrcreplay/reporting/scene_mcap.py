@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from hrcreplay.geometry.distances import nearest_pair
 from hrcreplay.human.model import skeleton
-from hrcreplay.records import JOINTS, LENGTHS, Floats
+from hrcreplay.records import JOINTS, LENGTHS, Bools, Floats
 from hrcreplay.reporting import scene_messages as parts
 from hrcreplay.reporting.metrics.series import thin_stretches, times
 from hrcreplay.reporting.replay_scene import LinkMesh, MethodTrack, ReplayScene, at_rate, placements, pose_links
@@ -312,7 +312,7 @@ def _transforms(scene: ReplayScene) -> Iterator[Message]:
 
 
 def _person(scene: ReplayScene) -> Iterator[Message]:
-    """Yields the fused skeletons, their points, and the recorded bodies as capsules."""
+    """Yields the fused skeletons, their points, and the recorded bodies as capsules; who has gone is updated once."""
     fields = [
         messages.PackedElementField(name=axis, offset=4 * i, type=messages.PackedElementFieldNumericType.Float32)
         for i, axis in enumerate("xyz")
@@ -322,10 +322,12 @@ def _person(scene: ReplayScene) -> Iterator[Message]:
     owned = np.split(np.arange(len(scene.body_parts)), len(names))
     shown, body = np.round(scene.points_m, 3), np.round(scene.body_m, 3)
     origin = parts.pose(np.zeros(3))
+    drawn, kept = ([_changes(ends_m[:, of_one]) for of_one in each] for ends_m, each in ((shown, pairs), (body, owned)))
     for i, t_ns in enumerate(scene.t_ns.tolist()):
         skeletons = [
             entity(t_ns, f"fused{name}", lines=[lines(shown[i, of_one], _BONE_M, parts.PERSON)])
-            for name, of_one in zip(names, pairs, strict=True)
+            for name, of_one, changes in zip(names, pairs, drawn, strict=True)
+            if changes[i]
         ]
         yield "/person/fused", t_ns, messages.SceneUpdate(entities=skeletons)
         known = shown[i][np.isfinite(shown[i]).all(axis=1)].astype("<f4")
@@ -335,9 +337,19 @@ def _person(scene: ReplayScene) -> Iterator[Message]:
         yield "/person/points", t_ns, cloud
         bodies = [
             entity(t_ns, f"recorded{name}", **capsules(body[i, of_one], scene.body_radius_m[of_one], _BODY))
-            for name, of_one in zip(names, owned, strict=True)
+            for name, of_one, changes in zip(names, owned, kept, strict=True)
+            if changes[i]
         ]
         yield "/person/recorded", t_ns, messages.SceneUpdate(entities=bodies)
+
+
+def _changes(ends_m: Floats) -> list[bool]:
+    """Instants at which some lines (n, k, 2, 3) are drawn, or no longer are, and the first one."""
+    known: Bools = np.asarray(np.isfinite(ends_m).all(axis=(2, 3)))
+    there: Bools = np.asarray(known.any(axis=1))
+    before = np.concatenate([[True], there[:-1]])
+    changes: list[bool] = (there | before).tolist()
+    return changes
 
 
 def _volumes(scene: ReplayScene) -> Iterator[Message]:

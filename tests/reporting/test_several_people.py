@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -81,6 +82,21 @@ def test_scene_mcap_has_an_entity_for_each(tmp_path: Path) -> None:
         at, other = (np.array([p.x, p.y, p.z]) for p in (mine.pose.position, theirs.pose.position))
         np.testing.assert_allclose(other - at, SECOND_M, atol=2e-3)
         assert mine.size.x == theirs.size.x
+
+
+def test_scene_mcap_updates_who_has_gone_once(tmp_path: Path) -> None:
+    points_m, body_m = BOTH.points_m.copy(), BOTH.body_m.copy()
+    points_m[60:, len(SHOWN_POINTS) :], body_m[60:, PARTS_SHOWN:] = np.nan, np.nan
+    write_scene(tmp_path / "scene.mcap", replace(BOTH, points_m=points_m, body_m=body_m), None)
+    found = _topics(tmp_path / "scene.mcap")
+    for topic, first in (("/person/fused", "fused"), ("/person/recorded", "recorded")):
+        entities = [message.entities for _, message in found[topic]]
+        assert len(entities) == len(BOTH.t_ns)
+        assert {one.id for one in entities[59]} == {first, f"{first} 2"}
+        (gone,) = (one for one in entities[60] if one.id == f"{first} 2")
+        assert not gone.spheres
+        assert not any(line.points for line in gone.lines)
+        assert all([one.id for one in later] == [first] for later in entities[61:])
 
 
 @pytest.fixture(scope="module")
