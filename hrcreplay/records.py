@@ -282,14 +282,17 @@ class HumanStates(Table):
 
     def ticks(self) -> tuple[Ints, Ints]:
         """The ticks (k,), and the first row of each with the number of rows at the end (k + 1,)."""
-        if self.person is None:
-            return self.t_ns, np.arange(len(self) + 1)
-        first = np.flatnonzero(np.diff(self.t_ns, prepend=self.t_ns[:1] - 1))
-        return self.t_ns[first], np.append(first, len(self))
+        return (self.t_ns, np.arange(len(self) + 1)) if self.person is None else ticks_of(self.t_ns)
 
     def of_person(self, number: int) -> HumanStates:
         """The rows of one person, as if there were no other."""
         return self if self.person is None else replace(self.rows(self.person == number), person=None)
+
+
+def ticks_of(t_ns: Ints) -> tuple[Ints, Ints]:
+    """The ticks (k,) of rows (n,) in order of time, and the first row of each with their number at the end (k + 1,)."""
+    first = np.flatnonzero(np.diff(t_ns, prepend=t_ns[:1] - 1))
+    return t_ns[first], np.append(first, len(t_ns))
 
 
 class AxisFrame(NamedTuple):

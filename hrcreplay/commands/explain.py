@@ -22,7 +22,17 @@ from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.pipeline import assembly
 from hrcreplay.pipeline.run_config import RunConfig, resolve
 from hrcreplay.pipeline.surroundings import Forecast, Surroundings
-from hrcreplay.records import ALLOWING_CONTACT, LIMBS, RECORDED, STATUSES, Floats, HumanStates, Ints, of_person
+from hrcreplay.records import (
+    ALLOWING_CONTACT,
+    LIMBS,
+    RECORDED,
+    STATUSES,
+    Floats,
+    HumanStates,
+    Ints,
+    of_person,
+    ticks_of,
+)
 from hrcreplay.reporting.metrics.planning import stationary
 from hrcreplay.reporting.metrics.series import true_runs
 from hrcreplay.reporting.tables import PageTable, neighbour_text, reason_text
@@ -38,14 +48,18 @@ from hrcreplay.robot.control.control_step import (
     stop_straight,
 )
 from hrcreplay.robot.control.controllers import Controller, QpController
-from hrcreplay.store.columns import motion_columns, read_states
+from hrcreplay.store.columns import motion_columns, read_states_at
 from hrcreplay.store.run_folder import arrow_table
-from hrcreplay.store.stored_table import RunTable
+from hrcreplay.store.stored_table import RunTable, StoredTable
 
 #: A TCP slower than this counts as stationary [m/s].
 _STANDS = 1e-3
 #: Numbers of ticks before the requested one at which the computation starts, if one tick does not reproduce the record.
 _BEFORE = (0, 25, 250)
+
+
+#: Ticks whose people are read together.
+_BATCH = 4096
 
 
 @dataclass
@@ -68,8 +82,9 @@ class Record:
             for name in ("q", "dq", "u")
         )
         self._status = self.motion["status"].astype(str).to_numpy()
-        self.states = HumanStates.join(list(read_states(self.folder / "state.parquet", 4096)))
-        _, self._first = self.states.ticks()
+        self.states = StoredTable(self.folder / "state.parquet")
+        self.ticks_ns, self.first = ticks_of(self.states["t_ns"].to_numpy())
+        self._batch: tuple[int, HumanStates] | None = None
         plan = self.run_config.settings.plan.model_copy(update={"method": self.method, "baselines": ()})
         self.run_config = replace(self.run_config, settings=self.run_config.settings.model_copy(update={"plan": plan}))
 
@@ -87,7 +102,7 @@ class Record:
     @cached_property
     def controller(self) -> Controller:
         """Makes the method's controller, at the start of its programme."""
-        (planner,) = assembly.planners(self.run_config, self.programme, int(self.states.t_ns[0])).values()
+        (planner,) = assembly.planners(self.run_config, self.programme, int(self.ticks_ns[0])).values()
         return planner.controller
 
     def read_as_recorded(self, tick: int) -> bool:
@@ -106,12 +121,18 @@ class Record:
 
     def people(self, tick: int) -> HumanStates:
         """The fused people at a tick, one row each."""
-        return self.states.rows(slice(int(self._first[tick]), int(self._first[tick + 1])))
+        start = tick - tick % _BATCH
+        if self._batch is None or self._batch[0] != start:
+            batch_ns = self.ticks_ns[start : start + _BATCH]
+            self._batch = start, read_states_at(self.folder / "state.parquet", batch_ns)
+        states, before = self._batch[1], int(self.first[start])
+        return states.rows(slice(int(self.first[tick]) - before, int(self.first[tick + 1]) - before))
 
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of all volumes, in the order of ``MotionRow.limb``."""
-        return self.surroundings.names_of(int(self.states.numbers.max()))
+        people = self.states["person"].to_numpy() if "person" in self.states else np.ones(1, np.int64)
+        return self.surroundings.names_of(int(people.max()))
 
     def again(self, tick: int) -> TickContext | None:
         """Computes the tick again; None if no attempt gives the recorded step bit by bit."""
@@ -349,18 +370,18 @@ def _objects(record: Record, tick: int) -> dict[str, Any]:
 
 def _cameras(record: Record, tick: int) -> dict[str, dict[str, float | None]]:
     """Camera -> time since its frames last entered the fused person, and the age of its newest frame then [s]."""
-    states, (ticks_ns, first) = record.states, record.states.ticks()
-    t_ns = int(ticks_ns[tick])
+    states, t_ns = record.states, int(record.ticks_ns[tick])
     path = record.folder / "measurements.parquet"
     frames = pq.read_table(path, columns=["camera", "capture_ns", "arrival_ns"]).to_pandas() if path.exists() else None
     found = {}
-    for i, camera in enumerate(states.cameras):
-        used = np.flatnonzero(states.valid[: first[tick + 1], i])
+    for valid in [name for name in states.columns if name.startswith("valid_")]:
+        camera = valid.removeprefix("valid_")
+        used = np.flatnonzero(states[valid].to_numpy(dtype=bool)[: record.first[tick + 1]])
         newest = None
         if frames is not None:
             arrived = frames[(frames["camera"] == camera) & (frames["arrival_ns"] <= t_ns)]
             newest = None if arrived.empty else (t_ns - int(arrived["capture_ns"].max())) * 1e-9
-        ago = None if not len(used) else (t_ns - int(states.t_ns[used[-1]])) * 1e-9
+        ago = None if not len(used) else (t_ns - int(states["t_ns"].to_numpy()[used[-1]])) * 1e-9
         found[camera] = {"used_s_ago": ago, "newest_frame_s_ago": newest}
     return found
 
