@@ -85,20 +85,22 @@ def measure(name: str, tmp: Path) -> dict[str, float]:
         ticks = np.flatnonzero(compared & (unseen_s > least_s) & (unseen_s <= most_s))[::_STEP]
         found[f"{when}_ticks"] = len(ticks)
         for what, states in zip(WHAT, (partly, whole.states), strict=True):
-            held, union_m3 = judge(stage, whole, states.rows(ticks))
-            found |= {f"{when}_{what}_held": held, f"{when}_{what}_m3": union_m3}
+            held, union_m3, median_m3 = judge(stage, whole, states.rows(ticks))
+            each = {"held": held, "m3": union_m3, "median_m3": median_m3}
+            found |= {f"{when}_{what}_{key}": value for key, value in each.items()}
     with mock.patch.object(shown_points, "PEOPLES_SPEEDS", SLOWLY * PEOPLES_SPEEDS):
         found[f"{WHEN[1]}_slow_m3"] = judge(stage, whole, partly.rows(ticks))[1]
     return found
 
 
-def judge(stage: PredictionStage, whole: Recording, states: HumanStates) -> tuple[float, float]:
-    """Share of some ticks with every recorded limb in its volume until the braking time, and the mean union [m^3]."""
+def judge(stage: PredictionStage, whole: Recording, states: HumanStates) -> tuple[float, float, float]:
+    """Share of some ticks with every recorded limb in its volume until the braking time; mean and median of the union."""
     future = recorded_future(whole.t_ns, whole.points_m, states, stage.horizon_s)
     every = np.ones(len(states), dtype=np.bool_)
     outcome = check_containment(stage.volumes(states), future, body_radii_m(stage), every, sizes=False)
     worst_m = outcome.worst_m()
-    return float((worst_m[np.isfinite(worst_m)] <= 0.0).mean()), float(np.nanmean(outcome.union_m3))
+    union_m3 = outcome.union_m3[np.isfinite(outcome.union_m3)]
+    return float((worst_m[np.isfinite(worst_m)] <= 0.0).mean()), float(union_m3.mean()), float(np.median(union_m3))
 
 
 def told(name: str, found: dict[str, float]) -> str:

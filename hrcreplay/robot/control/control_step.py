@@ -386,7 +386,14 @@ def observe(robot: RobotModel, state: RobotState, obstacles: Obstacles, clearanc
 
 
 def observe_people(robot: RobotModel, pose: RobotPose, obstacles: Obstacles, clearance_m: float) -> Sight:
-    """Nearest pair of link and limb of a robot whose pose is known; see ``observe``."""
+    """Nearest pair of link and limb of a robot whose pose is known; see ``observe``.
+
+    Args:
+        robot: The manipulator.
+        pose: Its pose at the tick.
+        obstacles: The swept volumes of the tick.
+        clearance_m: Clearance beyond limb radius + link radius [m].
+    """
     if not obstacles.known:
         return Sight(pose, None, math.nan, -1, -1, NO_HUMAN)
     hulls = obstacles.vertices_m, obstacles.offsets, obstacles.radius_m

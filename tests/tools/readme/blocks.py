@@ -224,7 +224,7 @@ def partly_seen(facts: Facts) -> str:
     of, rows = _of(facts, "partly seen"), []
     for name in PARTLY_SEEN_OF:
         each = [f"{name} {when}_{what}" for when in ("just", "long") for what in ("partly", "whole")]
-        cells = [f"{_share(of[f'{one}_held'])}, {_m3(of[f'{one}_m3'])}" for one in each]
+        cells = [f"{_share(of[f'{one}_held'])}, {_m3(of[f'{one}_m3'])} ({of[f'{one}_median_m3']:.1f})" for one in each]
         rows.append([name, *cells, _m3(of[f"{name} long_slow_m3"])])
     heads = [f"{when}, {what}" for when in ("0.1 to 0.5 s", "longer") for what in ("arms alone", "everything in sight")]
     return _table(["recording", *heads, f"longer, arms alone, at {SLOWLY:g} of the speeds"], rows)

@@ -130,7 +130,7 @@ def _oracled(numbers: Any) -> dict[str, Any]:
 
 def _partly_seen(numbers: Any) -> dict[str, Any]:
     each = [f"{when}_{what}" for when in ("just", "long") for what in ("partly", "whole")]
-    keys = [*(f"{one}_{what}" for one in each for what in ("held", "m3")), "long_slow_m3"]
+    keys = [*(f"{one}_{what}" for one in each for what in ("held", "m3", "median_m3")), "long_slow_m3"]
     return {name: {key: next(numbers) for key in keys} for name in PARTLY_SEEN_OF}
 
 
