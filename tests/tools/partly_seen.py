@@ -94,7 +94,7 @@ def measure(name: str, tmp: Path) -> dict[str, float]:
 
 
 def judge(stage: PredictionStage, whole: Recording, states: HumanStates) -> tuple[float, float, float]:
-    """Share of some ticks with every recorded limb in its volume until the braking time; mean and median of the union."""
+    """Share of ticks with every recorded limb in its volume until the braking time; mean and median union [m^3]."""
     future = recorded_future(whole.t_ns, whole.points_m, states, stage.horizon_s)
     every = np.ones(len(states), dtype=np.bool_)
     outcome = check_containment(stage.volumes(states), future, body_radii_m(stage), every, sizes=False)
