@@ -36,6 +36,7 @@ from hrcreplay.pipeline import assembly, reuse, stages
 from hrcreplay.pipeline.person_fuser import PersonFuser
 from hrcreplay.pipeline.run_config import RunConfig, resolve
 from hrcreplay.pipeline.stages import Sink, Told, collect_fusion_findings, collect_plan_findings
+from hrcreplay.pipeline.stored_volumes import StoredVolumes, store_every, store_volumes
 from hrcreplay.pipeline.surroundings import Forecast, Surroundings
 from hrcreplay.records import CameraFrames, Floats, HumanStates, Ints, Motion, SweptVolumes
 from hrcreplay.robot.control.controllers import Planner
@@ -247,7 +248,7 @@ class Volumes:
         """Returns the columns of occupancy.parquet, one row per tick and known limb."""
         found = _MemoryTables()
         found.table("occupancy", occupancy_columns(np.zeros(0, np.int64), [], self.volumes.method, [], [], [], []))
-        stages.store_volumes([stages.StoredVolumes(self.volumes, self.horizon_s)], found)
+        store_volumes([StoredVolumes(self.volumes, self.horizon_s)], found)
         return found.tables["occupancy"].to_pandas()
 
 
@@ -347,7 +348,7 @@ def plan(
     edges = [int(first[i]) for i in range(0, len(ticks), _BATCH)] + [len(people)]
     batches = (people.states.rows(slice(begin, end)) for begin, end in pairwise(edges))
     around = assembly.surroundings(run_config, model)
-    for _ in stages.plan_batches(batches, around, moved, stages.store_every(run_config), sink):
+    for _ in stages.plan_batches(batches, around, moved, store_every(run_config), sink):
         pass
     return Plan(run_config, found.tables, collect_plan_findings(log, sink))
 

@@ -35,6 +35,7 @@ from hrcreplay.pipeline.person_fuser import PersonFuser
 from hrcreplay.pipeline.progress import NO_PROGRESS, Progress
 from hrcreplay.pipeline.run_config import RunConfig, RunOptions, resolve
 from hrcreplay.pipeline.stages import Sink
+from hrcreplay.pipeline.stored_volumes import store_every
 from hrcreplay.pipeline.surroundings import Forecast
 from hrcreplay.records import DOF, JOINTS, LENGTHS, Floats, HumanStates, Ints
 from hrcreplay.robot.control.separation import Obstacles
@@ -171,7 +172,7 @@ def _time_stages(
     robot = assembly.robot(run_config, assembly.robot_base(run_config, log))
     moved = assembly.followers(run_config, assembly.programme(run_config, log, robot), int(ticks_ns[0]))
     fused = stages.fuse_batches(log, ticks_ns, size, assembly.fusion_stage(run_config, log), sink)
-    every = stages.store_every(run_config)
+    every = store_every(run_config)
     for _ in stages.plan_batches(keep(fused), assembly.surroundings(run_config, robot), moved, every, sink):
         pass
     return sink.watch, kept, HumanStates.join(states)

@@ -30,6 +30,7 @@ from hrcreplay.pipeline.robot_mass import robot_mass
 from hrcreplay.pipeline.run_config import RunConfig, RunOptions, resolve
 from hrcreplay.pipeline.second_process import MANY, second_process
 from hrcreplay.pipeline.stages import Sink, Told, collect_fusion_findings, collect_plan_findings
+from hrcreplay.pipeline.stored_volumes import store_every
 from hrcreplay.records import RECORDED, HumanStates, Ints
 from hrcreplay.reporting import tables
 from hrcreplay.reporting.summary_text import defect_notes
@@ -236,14 +237,14 @@ def run_stages(
         sink.notes["plan"].extend(programme.notes)
         moved = assembly.followers(run_config, programme, start_ns)
         sink.notes["plan"].extend(assembly.scene_notes(run_config, log, moved))
-        every = stages.store_every(run_config) if "predict" in todo else math.inf
+        every = store_every(run_config) if "predict" in todo else math.inf
         others = [name for name, one in moved.items() if not one.chosen and name != RECORDED]
         if second is not None:
             elsewhere = MethodsElsewhere(second, run_config, start_ns, others, folder, fused="fuse" in todo)
             moved = {name: one for name, one in moved.items() if name not in others}
         flow = stages.plan_batches(states, assembly.surroundings(run_config, robot), moved, every, sink, elsewhere)
     elif "predict" in todo:
-        every = stages.store_every(run_config)
+        every = store_every(run_config)
         flow = stages.predict_batches(states, assembly.prediction_stage(run_config), every, sink)
     if todo:
         for _ in flow:

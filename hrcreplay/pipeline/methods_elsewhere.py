@@ -15,7 +15,8 @@ from pathlib import Path
 from hrcreplay.logs.reader import open_log
 from hrcreplay.pipeline import assembly
 from hrcreplay.pipeline.run_config import RunConfig
-from hrcreplay.pipeline.stages import MethodsFollowing, Sink, store_stored_ticks
+from hrcreplay.pipeline.stages import MethodsFollowing, Sink
+from hrcreplay.pipeline.stored_volumes import store_ticks
 from hrcreplay.pipeline.surroundings import Forecast
 from hrcreplay.records import Floats, HumanStates, Ints
 from hrcreplay.store.columns import state_columns
@@ -75,7 +76,8 @@ class _Work:
             self._tables.table("state", state_columns(batch))
         forecast = Forecast(self._surroundings, replace(batch))  # sent records are not protected
         self._methods.take(forecast)
-        store_stored_ticks(forecast, stored, horizon_s, self._sink)
+        with self._sink.watch.stage("hulls", len(forecast.t_ns)):
+            store_ticks(forecast, stored, horizon_s, self._tables)
 
     def finish(self) -> Calls:
         self._tables.close_tables()

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from itertools import product
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from hrcreplay.calibration.clock_check import ClockCheck
 from hrcreplay.errors import LogError, SettingsError
-from hrcreplay.geometry.inflated_hull import InflatedHull
 from hrcreplay.human.fusion import inverse_kinematics, vacancy
 from hrcreplay.logs.camera_checks import CameraChecks
 from hrcreplay.logs.clocks import delay_text
@@ -23,9 +20,9 @@ from hrcreplay.pipeline.fusion_stage import FusionStage, SeenBodies
 from hrcreplay.pipeline.people_smoother import PeopleSmoother
 from hrcreplay.pipeline.person_fuser import PersonFuser
 from hrcreplay.pipeline.run_config import RunConfig
+from hrcreplay.pipeline.stored_volumes import StoredVolumes, select_stored_ticks, store_ticks, store_volumes
 from hrcreplay.pipeline.surroundings import Forecast, PredictionStage, Surroundings
 from hrcreplay.records import (
-    FLOOR_Z_M,
     NOBODY,
     CameraFrames,
     Floats,
@@ -34,21 +31,18 @@ from hrcreplay.records import (
     Measurements,
     Motion,
     SkeletonTrack,
-    SweptVolumes,
 )
 from hrcreplay.robot.control.static_obstacles import StaticObstacles, nearest
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.store.columns import (
     measurement_columns,
     motion_columns,
-    occupancy_columns,
     record_columns,
     state_columns,
     static_columns,
     truth_columns,
-    with_person,
 )
-from hrcreplay.store.run_folder import Stopwatch
+from hrcreplay.store.run_folder import Stopwatch, Tables
 
 NS = 1_000_000_000
 #: Prefixes of the names of counters for defective points and lost bodies.
@@ -63,13 +57,6 @@ _LOST = (
 
 #: Maximum length of a session; a longer log contains an arrival time from another clock [s].
 LONGEST_S = 24 * 3600
-
-
-class Tables(Protocol):
-    """Destination of table rows: a run folder or memory."""
-
-    def table(self, name: str, columns: Mapping[str, Any], /) -> None:
-        """Appends rows to a table."""
 
 
 class Told(NamedTuple):
@@ -145,12 +132,6 @@ def span_ticks(run_config: RunConfig, log: Log) -> Ints:
         )
         raise SettingsError(f"{option}: nothing of the log is left; it lasts {(last - first) / NS:.1f} s")
     return tick_times(start_ns, end_ns, run_config.settings.fusion.rate_hz)
-
-
-def store_every(run_config: RunConfig) -> float:
-    """Number of ticks per tick whose volumes are stored."""
-    store_hz = run_config.settings.prediction.store_hz
-    return 1.0 if store_hz == "all" else max(1.0, run_config.settings.fusion.rate_hz / store_hz)
 
 
 def batches(frames: Iterator[CameraFrames], ticks_ns: Ints, size: int) -> Iterator[tuple[Ints, CameraFrames | None]]:
@@ -434,53 +415,6 @@ def write_truth(log: Log, start_ns: int, end_ns: int, sink: Sink) -> None:
             sink.tables.table("truth", truth_columns(within.t_ns, *inverse_kinematics.inverse(within.points_m)))
 
 
-def select_stored_ticks(first: int, count: int, store_every: float) -> Ints:
-    """Selects the ticks whose volumes are stored among ``count`` ticks from ``first`` on: one in ``store_every``."""
-    if math.isinf(store_every):
-        return np.zeros(0, np.int64)
-    number = np.arange(first, first + count)
-    return np.flatnonzero(np.floor(number / store_every) != np.floor((number - 1) / store_every))
-
-
-class StoredVolumes(NamedTuple):
-    """Volumes that are stored."""
-
-    volumes: SweptVolumes  #: of any rows
-    horizon_s: float  #: time after its tick until which each row holds [s]
-    person: Ints | None = None  #: (n,) number of each row's person; None: person 1
-    rows: Ints | None = None  #: rows to store; None: all
-
-
-def store_volumes(parts: Iterable[StoredVolumes], tables: Tables) -> None:
-    """Writes hull vertices and volume above the floor; a row without a person has none."""
-    t_ns: list[int] = []
-    limbs: list[str] = []
-    radii: list[float] = []
-    sizes: list[float] = []
-    hulls: list[Floats] = []
-    horizons: list[float] = []
-    people: list[int] = []
-    method, numbered = "", False
-    for volumes, horizon_s, person, rows in parts:
-        method, numbered = volumes.method, person is not None
-        chosen = range(len(volumes)) if rows is None else rows.tolist()
-        for row, (i, limb) in product(chosen, enumerate(volumes.limbs)):
-            vertices = volumes.vertices(row, i)
-            if np.isnan(vertices).any():
-                continue
-            solid = InflatedHull.around(vertices, float(volumes.radius_m[row, i]))
-            t_ns.append(int(volumes.t_ns[row]))
-            limbs.append(limb)
-            radii.append(solid.radius_m)
-            sizes.append(solid.volume_above_m3(FLOOR_Z_M))
-            hulls.append(solid.vertices_m)
-            horizons.append(horizon_s)
-            people.append(1 if person is None else int(person[row]))
-    if t_ns:
-        columns = occupancy_columns(np.array(t_ns), limbs, method, radii, sizes, hulls, horizons)
-        tables.table("occupancy", with_person(columns, np.array(people)) if numbered else columns)
-
-
 def predict_batches(
     states: Iterable[HumanStates], prediction_stage: PredictionStage, store_every: float, sink: Sink
 ) -> Iterator[HumanStates]:
@@ -541,7 +475,8 @@ def plan_batches(
         stored = select_stored_ticks(done, ticks, store_every)
         if chosen is not None:
             if elsewhere is None:
-                store_stored_ticks(forecast, stored, chosen.horizon_s[stored], sink)
+                with sink.watch.stage("hulls", ticks):
+                    store_ticks(forecast, stored, chosen.horizon_s[stored], sink.tables)
             else:
                 elsewhere.take(batch, stored, chosen.horizon_s[stored])
         done += ticks
@@ -571,27 +506,6 @@ class MethodsFollowing:
             sink.tables.table("motion" if planner.chosen else f"motion_{name}", columns)
             chosen = motion if planner.chosen else chosen
         return chosen
-
-
-def store_stored_ticks(forecast: Forecast, stored: Ints, horizon_s: Floats, sink: Sink) -> None:
-    """Writes the volumes of some ticks of a batch, each until its own horizon.
-
-    Args:
-        forecast: The batch.
-        stored: (k,) index of each tick.
-        horizon_s: (k,) horizon of each, after its tick [s].
-        sink: Receives rows and times.
-    """
-    person = forecast.states.person
-
-    def volumes(tick: int, until_s: float) -> StoredVolumes:
-        rows = forecast.rows(tick)
-        found = forecast.person.volumes(until_s, rows.start, rows.stop)
-        return StoredVolumes(found, until_s, None if person is None else person[rows])
-
-    with sink.watch.stage("hulls", len(forecast.t_ns)):
-        each = zip(stored.tolist(), horizon_s.tolist(), strict=True)
-        store_volumes((volumes(tick, until_s) for tick, until_s in each), sink.tables)
 
 
 def nearest_columns(robot: RobotModel, static: StaticObstacles | None, motion: Motion) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
 import numpy as np
 import pandas as pd
@@ -124,6 +124,13 @@ def _one_nan(column: Any) -> Any:
     if isinstance(column, np.ndarray) and column.dtype == np.float64:
         return np.where(np.isnan(column), np.nan, column)
     return column
+
+
+class Tables(Protocol):
+    """Destination of table rows: a run folder or memory."""
+
+    def table(self, name: str, columns: Mapping[str, Any], /) -> None:
+        """Appends rows to a table."""
 
 
 class FolderTables:

@@ -18,9 +18,10 @@ from hrcreplay.errors import SettingsError
 from hrcreplay.limits import load_limits
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.logs.writer import LogWriter
-from hrcreplay.pipeline import assembly, reuse, stages
+from hrcreplay.pipeline import assembly, reuse
 from hrcreplay.pipeline.run_config import STAGES, RunConfig, resolve
 from hrcreplay.pipeline.stages import tick_times
+from hrcreplay.pipeline.stored_volumes import store_every
 from hrcreplay.settings.load import Settings
 from hrcreplay.store import run_folder
 from tests.facts import tells
@@ -291,7 +292,7 @@ def _handed(run_config: RunConfig, log: Log) -> dict[str, str]:
         key: value for key, value in run_config.settings.logs.model_dump().items() if not key.startswith("joint")
     }
     first = repr((fusion_stage, reading, _ticks(run_config, log).tolist()))
-    second = repr((prediction_stage, stages.store_every(run_config)))
+    second = repr((prediction_stage, store_every(run_config)))
     return {
         "fuse": first,
         "predict": second,

@@ -25,7 +25,8 @@ from hrcreplay.logs.reader import open_log
 from hrcreplay.pipeline import assembly
 from hrcreplay.pipeline.person_fuser import PersonFuser
 from hrcreplay.pipeline.run_config import RunConfig
-from hrcreplay.pipeline.stages import PeopleChecks, StoredVolumes, batches, nearest_columns, store_volumes
+from hrcreplay.pipeline.stages import PeopleChecks, batches, nearest_columns
+from hrcreplay.pipeline.stored_volumes import StoredVolumes, store_volumes
 from hrcreplay.records import BODY, DOF, LENGTHS, POINTS, HumanStates, Ints, Motion, volume_name
 from hrcreplay.robot.control.static_obstacles import StaticObstacles
 from hrcreplay.robot.model import RobotModel
