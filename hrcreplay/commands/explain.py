@@ -56,8 +56,6 @@ from hrcreplay.store.stored_table import RunTable, StoredTable
 _STANDS = 1e-3
 #: Numbers of ticks before the requested one at which the computation starts, if one tick does not reproduce the record.
 _BEFORE = (0, 25, 250)
-
-
 #: Ticks whose people are read together.
 _BATCH = 4096
 

@@ -69,7 +69,7 @@ def write_report(
     progress.begin("metrics")
     near = _bounds(run_config.settings.model_dump())
     meta["cameras"] = {name: T.tolist() for name, T in sorted(_camera_poses(run_config, log).items())}
-    elsewhere = None if second is None else second.submit(_write_scene, run_config, writer.partial, meta)
+    there = None if second is None else (second, second.submit(_write_scene, run_config, writer.partial, meta))
     everybody = run_folder.read(writer.partial, meta)
     found = compute(everybody, **near)
     run = everybody.of_person(everybody.people[0])
@@ -83,10 +83,9 @@ def write_report(
         radii["legs, of sound"] = prediction.legs_radius_m
     folder = writer.partial / "figures"
     kinds = catalogue.select_figures(run, found)
-    here = None if elsewhere is not None else writer.partial / "scene.mcap"
-    replay = _make_replay(run_config, everybody, here)  # before the figures: meanwhile the second process draws some
-    drawn_there = None if second is None or elsewhere is None else (second, elsewhere)
-    _draw_figures(run_config, everybody, found, kinds, folder, progress=progress, second=drawn_there)
+    here = None if there is not None else writer.partial / "scene.mcap"
+    replay = _make_replay(run_config, everybody, here)
+    _draw_figures(run_config, everybody, found, kinds, folder, progress=progress, second=there)
     progress.begin("page")
     shown = [
         tables.limit_table(run_config.prediction_limits, use="prediction"),
@@ -97,8 +96,8 @@ def write_report(
         "report.html",
         report_page.render(run, found, folder, shown, stops=stops, replay=replay, people=everybody.people),
     )
-    if elsewhere is not None:
-        elsewhere.result()
+    if there is not None:
+        there[1].result()
     if replay is not None:
         writer.text("foxglove-layout.json", foxglove_layout())
 

@@ -6,14 +6,13 @@ import multiprocessing
 import signal
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from threading import Lock
 from typing import Any, TypeVar
 
 #: Least number of ticks of a run with a second process, which takes seconds to start.
 MANY = 5000
-
 
 _T = TypeVar("_T")
 _R = TypeVar("_R")
@@ -55,8 +54,11 @@ def share(
         with lock:
             if not left:
                 return
+            try:
+                sent[left[-1]] = there(tasks[left[-1]])
+            except BrokenExecutor:  # it died: the task that it had tells so
+                return
             last = left.pop()
-            sent[last] = there(tasks[last])
         sent[last].add_done_callback(send)
 
     busy.add_done_callback(send)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -113,6 +113,32 @@ def test_nothing_is_sent_after_an_error_here() -> None:
         share(range(9), do, send, busy)
     busy.set_result(None)
     assert not sent
+
+
+def test_a_task_that_cannot_be_sent_is_done_here() -> None:
+    """So that the task which the dead process had tells that it died."""
+    busy: Future[None] = Future()
+    died: Future[str] = Future()
+    sent: list[int] = []
+    here: list[int] = []
+
+    def do(task: int) -> str:
+        here.append(task)
+        if task == 1:
+            died.set_exception(BrokenExecutor("it died"))
+        return ""
+
+    def send(task: int) -> Future[str]:
+        sent.append(task)
+        if len(sent) > 1:
+            raise BrokenExecutor("it is dead")
+        return died
+
+    busy.set_result(None)
+    with pytest.raises(BrokenExecutor, match="it died"):
+        share(range(5), do, send, busy)
+    assert sent == [4, 3]
+    assert here == [0, 1, 2, 3]
 
 
 def test_an_error_there_is_raised_here() -> None:

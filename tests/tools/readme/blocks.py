@@ -239,8 +239,8 @@ def coverage_cost(facts: Facts) -> str:
         rows.append([f"{factor:g}", *(f"{_share(share)}, {_m3(size)}" for share, size in pairs)])
     words = (
         "The narrowest of these lines that hold whole people in 99 % of the ticks take "
-        f"{_least_m3(of, until, 2)} and {_least_m3(of, until, COST_HORIZONS - 1)}: bounds of this form, balls that "
-        "grow with the horizon, with what the cameras show of a limb beside the model and its speed, need that much."
+        f"{_least_m3(of, until, 2)} and {_least_m3(of, until, COST_HORIZONS - 1)}. All lines were narrowed alike; "
+        "other ways to narrow them, or volumes other than balls around limbs, were not tried here."
     )
     return f"{_table(['lines times', *until], rows)}\n\n{_wrapped(words)}"
 
