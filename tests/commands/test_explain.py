@@ -21,12 +21,13 @@ from hrcreplay.commands import explain
 from hrcreplay.commands.explain import Record
 from hrcreplay.errors import SettingsError
 from hrcreplay.pipeline import assembly
-from hrcreplay.records import Floats
+from hrcreplay.records import Floats, HumanStates
 from hrcreplay.robot.control import active_constraints
 from hrcreplay.robot.control.active_constraints import LinearRows
 from hrcreplay.robot.control.metric_rows import Problem
 from hrcreplay.robot.control.row_search import SLACK
 from hrcreplay.store import run_folder
+from hrcreplay.store.columns import read_states
 from hrcreplay.store.run_folder import Run
 from tests.facts import facts, tells
 from tests.robot.checker import RADII, links
@@ -307,6 +308,24 @@ def test_baselines_are_made_again_too(demo_folder: Path, method: str) -> None:
         assert found is not None
         assert found["conflict"][0]["margin_m_per_s"] < 0.0
         assert tells(explain.cause(found), "braking", "path")
+
+
+def test_people_are_those_of_the_tick_whatever_is_read_together(
+    demo_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(explain, "_BATCH", 100)
+    record, states = (
+        explain.open_record(demo_folder),
+        HumanStates.join(list(read_states(demo_folder / "state.parquet", 4096))),
+    )
+    ticks_ns, first = states.ticks()
+    assert np.array_equal(record.ticks_ns, ticks_ns)
+    for tick in (0, 99, 100, 101, 250, 199, len(ticks_ns) - 1):
+        found, wanted = record.people(tick), states.rows(slice(int(first[tick]), int(first[tick + 1])))
+        assert found.t_ns.tolist() == wanted.t_ns.tolist() == [ticks_ns[tick]] * len(wanted)
+        np.testing.assert_array_equal(found.p, wanted.p)
+        np.testing.assert_array_equal(found.numbers, wanted.numbers)
+    assert record.names == record.surroundings.names_of(int(states.numbers.max()))
 
 
 def test_the_longest_stops_stand_in_the_report(demo_folder: Path, record: Record) -> None:

@@ -55,6 +55,14 @@ def bases(states: HumanStates) -> Iterator[str]:
         yield f"{x:.3f},{y:.3f},{hands[2] - BELOW_M:.3f},{yaw:.1f}"
 
 
+def parser(tool: str, says: str | None, each: str = "recording by recording") -> argparse.ArgumentParser:
+    """The arguments of a tool that measures recordings by their names."""
+    given = argparse.ArgumentParser(prog=f"python -m tests.tools.{tool}", description=says)
+    given.add_argument("names", nargs="*", metavar="NAME")
+    given.add_argument("--json", action="store_true", help=f"print one JSON object, {each}")
+    return given
+
+
 def with_base(cell: Path, base: str, out: Path) -> Path:
     """A cell file beside another base."""
     x, y, z, yaw = base.split(",")
@@ -129,10 +137,10 @@ def told(name: str, base: str, folder: Path) -> int:
 
 def main() -> int:
     """Runs the recordings."""
-    parser = argparse.ArgumentParser(prog="python -m tests.tools.bases", description=__doc__)
-    parser.add_argument("names", nargs="*")
-    parser.add_argument("--seconds", type=float, default=20.0)
-    given = parser.parse_args()
+    options = argparse.ArgumentParser(prog="python -m tests.tools.bases", description=__doc__)
+    options.add_argument("names", nargs="*")
+    options.add_argument("--seconds", type=float, default=20.0)
+    given = options.parse_args()
     faults = 0
     for name in given.names or [*IMPORTS, *BAGS]:
         with tempfile.TemporaryDirectory() as tmp:

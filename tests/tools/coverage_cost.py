@@ -63,10 +63,7 @@ def measure(names: list[str]) -> dict[str, dict[str, list[float]]]:
 
 def parser() -> argparse.ArgumentParser:
     """The arguments."""
-    given = argparse.ArgumentParser(prog="python -m tests.tools.coverage_cost", description=__doc__)
-    given.add_argument("names", nargs="*", metavar="NAME")
-    given.add_argument("--json", action="store_true", help="print one JSON object, factor by factor")
-    return given
+    return bases.parser("coverage_cost", __doc__, "factor by factor")
 
 
 def main() -> None:

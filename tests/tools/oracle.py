@@ -178,10 +178,8 @@ def told(name: str, found: dict[str, float]) -> str:
 
 def parser() -> argparse.ArgumentParser:
     """The arguments."""
-    given = argparse.ArgumentParser(prog="python -m tests.tools.oracle", description=__doc__)
-    given.add_argument("names", nargs="*", metavar="NAME")
+    given = bases.parser("oracle", __doc__)
     given.add_argument("--seconds", type=float, default=20.0)
-    given.add_argument("--json", action="store_true", help="print one JSON object, recording by recording")
     return given
 
 

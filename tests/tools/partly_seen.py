@@ -114,10 +114,7 @@ def told(name: str, found: dict[str, float]) -> str:
 
 def parser() -> argparse.ArgumentParser:
     """The arguments."""
-    given = argparse.ArgumentParser(prog="python -m tests.tools.partly_seen", description=__doc__)
-    given.add_argument("names", nargs="*", metavar="NAME")
-    given.add_argument("--json", action="store_true", help="print one JSON object, recording by recording")
-    return given
+    return bases.parser("partly_seen", __doc__)
 
 
 def main() -> None:
