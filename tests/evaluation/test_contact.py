@@ -227,6 +227,9 @@ def test_a_report_compares_every_method_with_the_truth(with_truth: Path) -> None
     assert not (with_truth / "smooth.parquet").exists()
     own = run.contact[run.contact["method"] == "qp"]
     assert own["left_full_m"].notna().sum() == pytest.approx(25 * (1.0 - 0.377), abs=1.5)
+    ends_s = (run.motion["t_ns"] - run.motion["t_ns"].iloc[0]) * 1e-9 + run.motion["horizon_s"]
+    assert own["left_m"].notna().sum() == pytest.approx((ends_s <= 1.0).sum() / 10, abs=1.5), "until its own horizon"
+    assert own["left_m"].notna().sum() > own["left_full_m"].notna().sum() + 3
     page = (with_truth / "report.html").read_text()
     found = verdict.verdict(run, report.compute(run, near_m=0.5, stationary_m_per_s=0.001))
     assert found is not None
