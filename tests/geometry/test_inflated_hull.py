@@ -9,6 +9,7 @@ import pytest
 from scipy.optimize import nnls
 from scipy.spatial.transform import Rotation
 
+from hrcreplay.geometry import inflated_hull
 from hrcreplay.geometry.inflated_hull import InflatedHull, union_volume_m3
 from hrcreplay.records import DOF, Floats
 
@@ -59,6 +60,19 @@ def test_a_missing_point_has_no_distance() -> None:
     found = InflatedHull.around(np.eye(3), 0.1).distances_m(np.array([[np.nan, 0.0, 0.0], [1.0, 0.0, 0.0]]))
     assert np.isnan(found[0])
     assert found[1] == 0.0
+
+
+@pytest.mark.parametrize("kind", SETS)
+def test_points_are_inside_within_the_radius_of_the_hull_and_only_there(kind: str) -> None:
+    """Each by its distance, which a solver that knows nothing of triangles gives above."""
+    rng = np.random.default_rng(11)
+    for _ in range(20):
+        solid = InflatedHull.around(SETS[kind](rng), float(rng.uniform(0.1, 1.5)))
+        low, high = solid.vertices_m.min(axis=0) - solid.radius_m, solid.vertices_m.max(axis=0) + solid.radius_m
+        samples = inflated_hull._spread(0, 4096) * (high - low) + low
+        inside = inflated_hull._inside([solid], low, high, 4096)
+        np.testing.assert_array_equal(inside, solid.distances_m(samples) <= solid.radius_m)
+        assert 0.02 < inside.mean() < 0.98
 
 
 def test_the_union_of_solids_apart_is_their_sum() -> None:
