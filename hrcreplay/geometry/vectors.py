@@ -57,6 +57,12 @@ def norm_n(v: Floats) -> float:
     return math.sqrt(dot_n(v, v))
 
 
+@njit(cache=True, inner=True)
+def distance(a: Floats, b: Floats) -> float:
+    """Distance between two points (3,) [m]."""
+    return np.sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)
+
+
 def speed_of(twist: Floats) -> float:
     """Length of the first three elements of a twist (6,) as ``norm_n`` gives it, without the call of a kernel."""
     x, y, z, *_ = twist.tolist()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
@@ -24,6 +24,7 @@ from hrcreplay.pipeline.stored_volumes import StoredVolumes, select_stored_ticks
 from hrcreplay.pipeline.surroundings import Forecast, PredictionStage, Surroundings
 from hrcreplay.records import (
     NOBODY,
+    POINTS,
     CameraFrames,
     Floats,
     HumanStates,
@@ -232,6 +233,7 @@ def _note_findings(
     if area is not None:
         notes.extend(_describe_area(log, area, sink.counts))
     notes.extend(_describe_others(sink.counts))
+    notes.extend(describe_disbelief(log.header.cameras, sink.counts))
 
 
 def _write_smoothed(parts: Iterable[HumanStates], sink: Sink) -> None:
@@ -246,6 +248,19 @@ def _describe_others(counts: Counter[str]) -> Iterator[str]:
             f"{others} frames show at least one other body than the person: it counts for contact, but there is no "
             "prediction for it and the robot does not react to it"
         )
+
+
+def describe_disbelief(cameras: Sequence[str], counts: Counter[str]) -> Iterator[str]:
+    """Returns a note on each camera whose view of some points was not believed."""
+    for camera in cameras:
+        found = [(name, counts[f"disbelieved_{name}_{camera}"]) for name in POINTS]
+        points = [f"{name} in {count:,} frames" for name, count in found if count]
+        if points:
+            yield (
+                f"camera {camera} shows points of a person wrong over time, which another camera shows elsewhere: "
+                f"{', '.join(points)}; they were left out: more cameras agree on another place, bones have the wrong "
+                "length, or the points are below the floor; look at what hides them from it, and at its pose"
+            )
 
 
 def _describe_area(log: Log, seen: vacancy.VacancyState, counts: Counter[str]) -> Iterator[str]:

@@ -8,7 +8,7 @@ from hrcreplay.human.fusion.inverse_kinematics import measure
 from hrcreplay.human.model import skeleton
 from hrcreplay.records import POINTS, Floats, Ints, Measurements
 from hrcreplay.settings.sections import Fusion
-from tests.human.sightings import LENGTHS_M, NEUTRAL, frames_of
+from tests.human.sightings import CAMERAS, LENGTHS_M, NEUTRAL, frames_of
 
 #: Pelvis standing, and how far it goes down [m].
 STANDING_M, DOWN_M = 0.94, 0.45
@@ -68,14 +68,17 @@ def _knee(hip: Floats, ankle: Floats, ahead: Floats) -> Floats:
     return np.asarray(hip + along[:, None] * unit + off[:, None] * front / np.linalg.norm(front, axis=1)[:, None])
 
 
-def seen(duration_s: float, kind: str, seed: int, noise_m: float = 0.005) -> tuple[Measurements, float]:
-    """What two cameras of 30 Hz, 20 ms late, see of it, and how long it takes [s]."""
+def seen(
+    duration_s: float, kind: str, seed: int, noise_m: float = 0.005, cameras: tuple[str, ...] = CAMERAS
+) -> tuple[Measurements, float]:
+    """What cameras of 30 Hz, 20 ms late, see of it, and how long it takes [s]."""
     end_s = 3.0 * STILL_S + 2.0 * duration_s
     instants = np.arange(0.0, end_s, 1.0 / 30.0)
-    capture: Ints = np.concatenate([np.round((instants + 0.013 * c) * 1e9).astype(np.int64) for c in range(2)])
-    camera = np.repeat(np.arange(2), len(instants))
+    n = len(cameras)
+    capture: Ints = np.concatenate([np.round((instants + 0.013 * c) * 1e9).astype(np.int64) for c in range(n)])
+    camera = np.repeat(np.arange(n), len(instants))
     order = np.argsort(capture, kind="stable")
     points = body(np.asarray(capture[order] * 1e-9, dtype=np.float64), duration_s, kind)
     points += np.random.default_rng(seed).normal(0.0, noise_m, points.shape)
-    frames = frames_of(points, camera[order], capture[order], 20_000_000)
-    return measure(frames, np.tile(np.eye(4), (2, 1, 1)), Fusion()), end_s
+    frames = frames_of(points, camera[order], capture[order], 20_000_000, cameras)
+    return measure(frames, np.tile(np.eye(4), (n, 1, 1)), Fusion()), end_s

@@ -24,7 +24,9 @@ def lengths(n: int, seed: int) -> Floats:
     return np.random.default_rng(seed).uniform(0.15, 1.0, (n, len(LENGTHS)))
 
 
-def frames_of(points_m: Floats, camera: Ints, capture_ns: Ints, delay_ns: int = 0) -> CameraFrames:
+def frames_of(
+    points_m: Floats, camera: Ints, capture_ns: Ints, delay_ns: int = 0, cameras: tuple[str, ...] = CAMERAS
+) -> CameraFrames:
     """World points as frames of cameras that stand at the world's origin."""
     seen = np.isfinite(points_m[:, :, 0])
     return CameraFrames(
@@ -34,7 +36,7 @@ def frames_of(points_m: Floats, camera: Ints, capture_ns: Ints, delay_ns: int = 
         body=np.zeros_like(camera),
         points_m=points_m,
         confidence=seen.astype(np.float64),
-        cameras=CAMERAS,
+        cameras=cameras,
     )
 
 

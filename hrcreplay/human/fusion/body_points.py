@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from hrcreplay.human.fusion.gating import distance
+from hrcreplay.geometry.vectors import distance
+from hrcreplay.human.fusion.disbelief import SHOWN_NS, is_broken, shows
 from hrcreplay.human.fusion.kalman import Filter, Rules
 from hrcreplay.human.model import ARM_POINTS, HANDS, HEAD, LEG_POINTS, NECK, PELVIS, skeleton_row, torso_rotation
 from hrcreplay.kernels import njit
@@ -22,14 +23,10 @@ REACH_M = 1.2
 _HAND_M = 0.3
 #: Distance of a foot's tip from its ankle, along the body's heading, until a camera has seen it: about a man's [m].
 FOOT_M = (0.2, 0.0, -0.06)
-#: Maximum age of the observation of a point, a few frames of any camera; an older hand or leg is unknown [ns].
-SHOWN_NS = 200_000_000
 #: Distance below which two places of a point are the same but for the noise of a tracker [m].
 ALIKE_M = 0.05
-#: Change of a bone's length beyond which the point at its far end is not on the limb.
-BROKEN = 0.3
-#: Number of observations after which the length of a leg's bone is known, and most that count in its mean.
-_BONES_KNOWN, _BONES_MOST = 20, 600
+#: Maximum number of observations in the mean length of a leg's bone.
+_BONES_MOST = 600
 
 (_SHOULDER_R, _ELBOW_R, _WRIST_R), (_SHOULDER_L, _ELBOW_L, _WRIST_L) = ARM_POINTS
 _LEGS = BODY.index("LEGS")
@@ -138,7 +135,8 @@ def _compare_bone(filter_: Filter, c: int, now: int, side: int, bone: int, near:
     """Compares a thigh (bone 0) or shank (1) with the mean of the camera, and adds it or rules out what is below.
 
     A bone keeps its length; a skeleton that falls apart before the tracker loses it does not. A new length that stays
-    may be another opinion of the same leg: it is believed, but not learnt, as the old one may come back.
+    may be another opinion of the same leg: it is not learnt, as the old one may come back, but believed, unless another
+    camera shows the leg all the while (``disbelief``).
 
     Args:
         filter_: Contains the frame; the mean lengths are changed.
@@ -152,27 +150,26 @@ def _compare_bone(filter_: Filter, c: int, now: int, side: int, bone: int, near:
     if not (near[upper] and near[lower]):
         return
     model, own = filter_.model, 2 * bone + side  # each leg for itself: a whole one does not vouch for the other
-    length = distance(filter_.gate.points[c, LEG_POINTS[upper]], filter_.gate.points[c, LEG_POINTS[lower]])
-    seen, mean = model.leg_bones_seen[c, own], model.leg_bones[c, own]
-    if seen >= _BONES_KNOWN and abs(length - mean) > BROKEN * mean:
+    if is_broken(filter_, c, side, bone):
         if now - model.leg_bones_ns[c, own] <= SHOWN_NS:  # later it is no skeleton that falls apart
             near[lower::2] = False
         return
-    seen = min(seen + 1, _BONES_MOST)
-    model.leg_bones[c, own] = mean + (length - mean) / seen
+    length = distance(filter_.gate.points[c, LEG_POINTS[upper]], filter_.gate.points[c, LEG_POINTS[lower]])
+    seen = min(model.leg_bones_seen[c, own] + 1, _BONES_MOST)
+    model.leg_bones[c, own] += (length - model.leg_bones[c, own]) / seen
     model.leg_bones_seen[c, own], model.leg_bones_ns[c, own] = seen, now
 
 
 @njit(cache=True, inner=True)
 def _near(filter_: Filter, c: int, k: int, place: Floats, most: float, rules: Rules) -> bool:
     """Returns True if a camera shows a point with enough confidence within ``most`` [m] of a place."""
-    shown = filter_.gate.confidence[c, k] >= rules.confidence_min
-    return bool(shown and distance(filter_.gate.points[c, k], place) <= most)
+    return bool(shows(filter_, c, k, rules) and distance(filter_.gate.points[c, k], place) <= most)
 
 
 @njit(cache=True, inner=True)
 def _carry(filter_: Filter, c: int, k: int, relative: Floats) -> None:
-    if filter_.gate.capture_ns[c] >= filter_.model.carried_ns[c, k]:
+    newer = filter_.gate.capture_ns[c] >= filter_.model.carried_ns[c, k]
+    if newer and not filter_.gate.disbelieved[c, k]:
         filter_.model.carried[c, k], filter_.model.carried_ns[c, k] = relative, filter_.gate.capture_ns[c]
 
 

@@ -101,6 +101,9 @@ def start(cameras: tuple[str, ...]) -> FusionState:
             valid=np.zeros((c, ROWS), dtype=np.bool_),
             shows=np.zeros((c, len(LIMBS)), dtype=np.bool_),
             trusted=np.zeros((c, len(POINTS)), dtype=np.bool_),
+            wrong=np.zeros((c, len(POINTS))),
+            judged_ns=np.full(c, NEVER_NS),
+            disbelieved=np.zeros((c, len(POINTS)), dtype=np.bool_),
         ),
         model=ModelResidual(
             residuals=np.zeros((len(BODY), BINS)),
@@ -160,9 +163,10 @@ def fuse(
 
     Returns:
         The filter after the last tick, the states (n ticks; NaN before the first valid row), counts of events:
-        ``outlier_points_<camera>``, ``superseded_frames_<camera>`` (a newer frame had come), ``joints_reacquired``,
-        ``ticks_saturated``, and the trace of the n ticks, which has no rows unless ``traced``. The bits of the states
-        do not depend on the division of ticks into calls.
+        ``outlier_points_<camera>``, ``disbelieved_<point>_<camera>`` if there are any (``disbelief``),
+        ``superseded_frames_<camera>`` (a newer frame had come), ``joints_reacquired``, ``ticks_saturated``, and the
+        trace of the n ticks, which has no rows unless ``traced``. The bits of the states do not depend on the division
+        of ticks into calls.
     """
     after = _copy(state)
     track = _track(len(ticks_ns), len(measurements.cameras), traced=traced)
@@ -196,6 +200,8 @@ def _count_events(track: Track, cameras: Sequence[str]) -> Counter[str]:
     for c, camera in enumerate(cameras):
         counts[f"outlier_points_{camera}"] = int(track.outliers[c])
         counts[f"superseded_frames_{camera}"] = int(track.superseded[c])
+        for k in np.flatnonzero(track.disbelieved[c]):
+            counts[f"disbelieved_{POINTS[k]}_{camera}"] = int(track.disbelieved[c, k])
     return counts
 
 
@@ -280,6 +286,7 @@ def _track(n: int, cameras: int, *, traced: bool) -> Track:
         spread=np.full((rows, DOF), np.nan),
         autocorrelation=np.full((rows, DOF), np.nan),
         outliers=np.zeros(cameras, dtype=np.int64),
+        disbelieved=np.zeros((cameras, len(POINTS)), dtype=np.int64),
         superseded=np.zeros(cameras, dtype=np.int64),
         reacquired=np.zeros(1, dtype=np.int64),
         saturated=np.zeros(1, dtype=np.int64),

@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from hrcreplay.geometry.vectors import distance
+from hrcreplay.human.fusion.disbelief import judge
 from hrcreplay.human.fusion.inverse_kinematics import DEPENDS, ROWS
 from hrcreplay.human.fusion.kalman import NEVER_NS, Filter, Rules, Track, delay, extrapolate_back
 from hrcreplay.human.model import ARM_POINTS, HEAD, HEIGHT, LEFT_ARM, NECK, PELVIS, RIGHT_ARM, skeleton_row
@@ -62,14 +64,16 @@ def validate_frame(filter_: Filter, c: int, now: int, rules: Rules, track: Track
         c: Index of the camera.
         now: The tick [ns].
         rules: Settings of the filter.
-        track: Receives the number of points that disagree with the filter.
+        track: Receives the number of points that disagree with the filter, and of those not believed.
     """
     trusted = np.ones(len(filter_.gate.point_ns), dtype=np.bool_)
     believed = np.zeros(len(filter_.gate.point_ns), dtype=np.bool_)
     if filter_.estimate.started[0]:
         whole = _whole(filter_, c, now, rules)
+        judge(filter_, c, now, whole, rules)
         agreeing, believed = _agreeing(filter_, c, now, whole, rules)
-        trusted = (agreeing | believed) & whole
+        trusted = (agreeing | believed) & whole & ~filter_.gate.disbelieved[c]
+        track.disbelieved[c] += filter_.gate.disbelieved[c]
         track.outliers[c] += len(trusted) - np.sum(trusted)
     _validate_rows(filter_, c, trusted, rules)
     for row in np.flatnonzero(filter_.gate.valid[c]):
@@ -177,7 +181,7 @@ def _whole(filter_: Filter, c: int, now: int, rules: Rules) -> Bools:
     """Returns the points of a frame (20,) except those at the far end of a bone of wrong length.
 
     Bone lengths are constant, which distinguishes a jumping marker from a moving limb. A length that no camera has
-    confirmed for a long time was learnt wrong: it restarts.
+    confirmed for a long time was learnt wrong: it restarts. Points that are not believed confirm nothing.
     """
     whole = np.ones(len(filter_.gate.point_ns), dtype=np.bool_)
     for k in range(len(filter_.estimate.lengths)):
@@ -186,14 +190,8 @@ def _whole(filter_: Filter, c: int, now: int, rules: Rules) -> Bools:
             continue
         if filter_.estimate.bone_ns[k] >= 0 and now - filter_.estimate.bone_ns[k] > rules.bone_memory_ns:
             filter_.estimate.lengths_var[k] = _UNKNOWN_M**2
-        if apart <= rules.bone_m + 3.0 * np.sqrt(filter_.estimate.lengths_var[k]):
-            filter_.estimate.bone_ns[k] = now
-        else:
+        if apart > rules.bone_m + 3.0 * np.sqrt(filter_.estimate.lengths_var[k]):
             whole &= ~_ENDS[k]
+        elif not (_ENDS[k] & filter_.gate.disbelieved[c]).any():
+            filter_.estimate.bone_ns[k] = now
     return whole
-
-
-@njit(cache=True, inner=True)
-def distance(a: Floats, b: Floats) -> float:
-    """Distance between two points (3,) [m]."""
-    return np.sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)

@@ -50,7 +50,10 @@ class Gate(NamedTuple):
     confidence: Floats  #: (c, 20)
     valid: Bools  #: (c, 20) True for its used rows
     shows: Bools  #: (c, 6) True for limbs that it shows, together with all limbs that carry them
-    trusted: Bools  #: (c, 20) True for its points that agree with the filter, or are believed
+    trusted: Bools  #: (c, 20) True for its points that agree with the filter, or were relearnt, and count
+    wrong: Floats  #: (c, 20) share of the recent frames with evidence against a point
+    judged_ns: Ints  #: (c,) tick of the last frame that was judged
+    disbelieved: Bools  #: (c, 20) True for points that it shows wrong, while another camera shows them
 
 
 class ModelResidual(NamedTuple):
@@ -142,6 +145,7 @@ class Track(NamedTuple):
     spread: Floats  #: (n or 0, 13) of the filter
     autocorrelation: Floats  #: (n or 0, 13) of the innovations
     outliers: Ints  #: (c,)
+    disbelieved: Ints  #: (c, 20)
     superseded: Ints  #: (c,)
     reacquired: Ints  #: (1,)
     saturated: Ints  #: (1,)

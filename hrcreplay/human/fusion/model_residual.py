@@ -18,8 +18,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from hrcreplay.geometry.vectors import distance
 from hrcreplay.human.fusion.body_points import REACH_M, distance_shown, learn, shift
-from hrcreplay.human.fusion.gating import distance
+from hrcreplay.human.fusion.disbelief import shows
 from hrcreplay.human.fusion.kalman import Filter, Rules, delay, extrapolate_back
 from hrcreplay.human.model import ARM_POINTS, BENDS, HEAD, HEIGHT, LEFT_ARM, PELVIS, RIGHT_ARM, skeleton_row
 from hrcreplay.kernels import njit
@@ -100,7 +101,7 @@ def _depart(filter_: Filter, c: int, model: Floats, now: int, rules: Rules) -> N
     for limb in range(len(_ENDS)):
         for k in _ENDS[limb]:
             since = filter_.gate.refused_ns[c, k]
-            if since <= filter_.gate.point_ns[k]:
+            if since <= filter_.gate.point_ns[k] or filter_.gate.disbelieved[c, k]:
                 continue
             here, shown = filter_.gate.refused_at[c, k], since < now
             for other in range(len(filter_.gate.apart)):
@@ -140,7 +141,8 @@ def _farthest(filter_: Filter, c: int, points: Ints, pelvis: Floats, rules: Rule
     farthest = -1.0
     for k in points:
         point = filter_.gate.points[c, k]
-        if filter_.gate.confidence[c, k] >= rules.confidence_min and distance(point, pelvis) <= REACH_M:
+        near = shows(filter_, c, k, rules) and distance(point, pelvis) <= REACH_M
+        if near and not filter_.gate.disbelieved[c, k]:
             beyond = point[2] - max(0.0, min(point[2], pelvis[2]))
             off = np.sqrt((point[0] - pelvis[0]) ** 2 + (point[1] - pelvis[1]) ** 2 + beyond**2)
             farthest = max(farthest, off)
