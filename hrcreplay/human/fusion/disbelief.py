@@ -100,7 +100,14 @@ def is_broken(filter_: Filter, c: int, side: int, bone: int) -> bool:
 
 @njit(cache=True, inner=True)
 def _votes(filter_: Filter, c: int, k: int, rules: Rules) -> tuple[int, int]:
-    """Returns how many cameras show a point where camera c does, itself included, and how many agree elsewhere."""
+    """Returns how many cameras show a point where camera c does, itself included, and how many agree elsewhere.
+
+    Args:
+        filter_: Contains the frames.
+        c: Index of the camera.
+        k: Index of the point.
+        rules: Settings of the filter.
+    """
     gate = filter_.gate
     with_it, elsewhere = 1, 0
     for a in range(len(gate.uses)):
@@ -120,7 +127,15 @@ def _votes(filter_: Filter, c: int, k: int, rules: Rules) -> tuple[int, int]:
 
 @njit(cache=True, inner=True)
 def _comparable(filter_: Filter, a: int, c: int, k: int, rules: Rules) -> bool:
-    """Returns True if the stored frame of camera a shows a point, at about the time of that of camera c."""
+    """Returns True if the stored frame of camera a shows a point, at about the time of that of camera c.
+
+    Args:
+        filter_: Contains the frames.
+        a: Index of the one camera.
+        c: Index of the other.
+        k: Index of the point.
+        rules: Settings of the filter.
+    """
     gate = filter_.gate
     together = abs(gate.capture_ns[a] - gate.capture_ns[c]) <= _SAME_TIME_NS
     return gate.uses[a] >= 0 and together and shows(filter_, a, k, rules)
@@ -128,7 +143,15 @@ def _comparable(filter_: Filter, a: int, c: int, k: int, rules: Rules) -> bool:
 
 @njit(cache=True, inner=True)
 def _shown_by_another(filter_: Filter, c: int, k: int, now: int, rules: Rules) -> bool:
-    """Returns True if a camera whose view of a point is believed shows it."""
+    """Returns True if a camera whose view of a point is believed shows it.
+
+    Args:
+        filter_: Contains the frames.
+        c: Index of the camera that does not count.
+        k: Index of the point.
+        now: The tick [ns].
+        rules: Settings of the filter.
+    """
     gate = filter_.gate
     for a in range(len(gate.uses)):
         fresh = gate.uses[a] >= 0 and now - gate.capture_ns[a] <= SHOWN_NS

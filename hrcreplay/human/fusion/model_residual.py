@@ -101,7 +101,7 @@ def _depart(filter_: Filter, c: int, model: Floats, now: int, rules: Rules) -> N
     for limb in range(len(_ENDS)):
         for k in _ENDS[limb]:
             since = filter_.gate.refused_ns[c, k]
-            if since <= filter_.gate.point_ns[k] or filter_.gate.disbelieved[c, k]:
+            if since <= filter_.gate.point_ns[k]:
                 continue
             here, shown = filter_.gate.refused_at[c, k], since < now
             for other in range(len(filter_.gate.apart)):

@@ -10,7 +10,7 @@ import pytest
 from hrcreplay.human.fusion.fuse import fuse, start
 from hrcreplay.human.fusion.inverse_kinematics import measure
 from hrcreplay.pipeline.stages import describe_disbelief
-from hrcreplay.records import POINTS, Bools, CameraFrames, Floats, HumanStates, Measurements
+from hrcreplay.records import BODY, LENGTHS, POINTS, Bools, CameraFrames, Floats, HumanStates, Measurements
 from hrcreplay.settings.sections import Fusion
 from tests.human import rising
 from tests.human.filtered import WIDE, ticks, until
@@ -64,6 +64,9 @@ def test_two_cameras_that_agree_outvote_a_third_one_after_a_while(names: tuple[s
         assert farthest_m(wrong, names[1], truth(), 0.5, 1.0) > 0.35
     told = {name for name in counts if name.startswith("disbelieved")}
     assert told == {f"disbelieved_{name}_c" for name in names}
+    plain, _ = fused(seen)
+    legs = BODY.index("LEGS")
+    assert wrong.residual_m[-1, legs] == pytest.approx(plain.residual_m[-1, legs], abs=0.02)
     shown = int((seen.camera == 2).sum())
     assert all(0.6 * shown < counts[name] < shown for name in told)
 
@@ -110,6 +113,27 @@ def test_without_evidence_both_cameras_count() -> None:
     states, counts = fused(moved(seen, LEG, (0.0, 0.4, 0.0), seen.camera == 1))
     assert not [name for name in counts if name.startswith("disbelieved")]
     assert farthest_m(states, "ankle_l", truth(), 4.0, END_S) > 0.35
+
+
+def test_where_both_cameras_are_wrong_both_count() -> None:
+    seen, foot = standing(TWO), ("ankle_l", "foot_l")
+    low = moved(seen, foot, (0.0, 0.0, -0.25), seen.camera >= 0)
+    states, counts = fused(moved(low, foot, (0.0, 0.3, 0.0), seen.camera == 1))
+    told = [count for name, count in counts.items() if name.startswith("disbelieved")]
+    assert max(told, default=0) <= 2  # until there is evidence against the second one, too
+    assert farthest_m(states, "foot_l", truth(), 4.0, END_S) > 0.35
+
+
+def test_a_length_that_only_a_disbelieved_point_shows_is_forgotten() -> None:
+    """Otherwise the forearm by which the filter began would exclude the true one for ever."""
+    seen = standing(THREE)
+    late = (seen.camera == 2) | (seen.capture_ns > 500_000_000)
+    seen = moved(seen, ("wrist_r",), (0.3, 0.3, 0.3), seen.camera == 2).rows(late)
+    settings = Fusion(bone_memory_s=0.5)
+    t_ns = ticks(END_S)
+    _, states, _, _ = fuse(start(seen.cameras), t_ns, until(seen, int(t_ns[-1])), settings, WIDE)
+    assert states.lengths_m[-1, LENGTHS.index("pi_forearm_r")] == pytest.approx(0.26, abs=0.05)
+    assert farthest_m(states, "wrist_r", truth(), 5.0, END_S) < 0.1
 
 
 def test_two_against_two_are_no_evidence() -> None:
