@@ -78,7 +78,14 @@ def judge(filter_: Filter, c: int, now: int, whole: Bools, rules: Rules) -> None
 
 @njit(cache=True, inner=True)
 def shows(filter_: Filter, c: int, k: int, rules: Rules) -> bool:
-    """Returns True if the stored frame of a camera shows a point with enough confidence."""
+    """Returns True if the stored frame of a camera shows a point with enough confidence.
+
+    Args:
+        filter_: Contains the frame.
+        c: Index of the camera.
+        k: Index of the point.
+        rules: Settings of the filter.
+    """
     return bool(filter_.gate.confidence[c, k] >= rules.confidence_min and np.isfinite(filter_.gate.points[c, k, 0]))
 
 
