@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
@@ -12,6 +12,7 @@ import numpy as np
 from hrcreplay.calibration.clock_check import ClockCheck
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.human.fusion import inverse_kinematics, vacancy
+from hrcreplay.human.fusion.disbelief import disbelieved
 from hrcreplay.logs.camera_checks import CameraChecks
 from hrcreplay.logs.clocks import delay_text
 from hrcreplay.logs.reader import Log
@@ -24,7 +25,6 @@ from hrcreplay.pipeline.stored_volumes import StoredVolumes, select_stored_ticks
 from hrcreplay.pipeline.surroundings import Forecast, PredictionStage, Surroundings
 from hrcreplay.records import (
     NOBODY,
-    POINTS,
     CameraFrames,
     Floats,
     HumanStates,
@@ -233,7 +233,7 @@ def _note_findings(
     if area is not None:
         notes.extend(_describe_area(log, area, sink.counts))
     notes.extend(_describe_others(sink.counts))
-    notes.extend(describe_disbelief(log.header.cameras, sink.counts))
+    notes.extend(_describe_disbelief(sink.counts))
 
 
 def _write_smoothed(parts: Iterable[HumanStates], sink: Sink) -> None:
@@ -250,17 +250,15 @@ def _describe_others(counts: Counter[str]) -> Iterator[str]:
         )
 
 
-def describe_disbelief(cameras: Sequence[str], counts: Counter[str]) -> Iterator[str]:
+def _describe_disbelief(counts: Counter[str]) -> Iterator[str]:
     """Returns a note on each camera whose view of some points was not believed."""
-    for camera in cameras:
-        found = [(name, counts[f"disbelieved_{name}_{camera}"]) for name in POINTS]
-        points = [f"{name} in {count:,} frames" for name, count in found if count]
-        if points:
-            yield (
-                f"camera {camera} shows points of a person wrong over time, which another camera shows elsewhere: "
-                f"{', '.join(points)}; they were left out: more cameras agree on another place, bones have the wrong "
-                "length, or the points are below the floor; look at what hides them from it, and at its pose"
-            )
+    for camera, points in disbelieved(counts).items():
+        frames = ", ".join(f"{point} {count}" for point, count in points.items())
+        yield (
+            f"camera {camera} shows points of a person wrong over time, and another camera shows them elsewhere; "
+            f"left out of the filter and the volumes, in frames: {frames}; more cameras agree on another place, a bone "
+            "has a wrong length, or the point is below the floor; look at what hides them from it, and at its pose"
+        )
 
 
 def _describe_area(log: Log, seen: vacancy.VacancyState, counts: Counter[str]) -> Iterator[str]:

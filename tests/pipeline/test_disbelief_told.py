@@ -26,5 +26,5 @@ def test_a_run_tells_which_camera_shows_a_foot_below_the_floor(tmp_path: Path) -
     name = crowd.SENSORS[1].name
     (line,) = [note for note in told["notes"] if "wrong over time" in note]
     assert line.startswith(f"camera {name} shows")
-    assert all(f"{point} in {told['counts'][f'disbelieved_{point}_{name}']} frames" in line for point in FOOT)
+    assert all(f"{point} {told['counts'][f'disbelieved_{point}_{name}']}" in line for point in FOOT)
     assert "knee" not in line

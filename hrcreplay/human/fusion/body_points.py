@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 from hrcreplay.geometry.vectors import distance
-from hrcreplay.human.fusion.disbelief import SHOWN_NS, is_broken, shows
-from hrcreplay.human.fusion.kalman import Filter, Rules
+from hrcreplay.human.fusion.disbelief import is_broken
+from hrcreplay.human.fusion.kalman import SHOWN_NS, Filter, Rules, shows
 from hrcreplay.human.model import ARM_POINTS, HANDS, HEAD, LEG_POINTS, NECK, PELVIS, skeleton_row, torso_rotation
 from hrcreplay.kernels import njit
 from hrcreplay.records import BODY, LIMBS, POINTS, Bools, Floats

@@ -7,30 +7,32 @@ Where two cameras show a point apart, nobody knows which is right, and the volum
   or the trunk unlike the person's, or one of a leg unlike what this camera showed before.
 
 A camera of which most points are wrong may look at somebody else, or have a wrong pose: that is no evidence against a
-limb. The share of the frames with evidence is a running mean with a memory of ``_MEMORY_S``. Beyond a half, the point
-is disbelieved: it enters neither the filter nor the volumes as long as a camera that is believed shows it.
+limb. Cameras that are wrong alike outvote one that is right, so it is told. The share of the frames with evidence is a
+running mean with a memory of ``_MEMORY_S``. Beyond a half, the point is disbelieved: it enters neither the filter nor
+the volumes as long as a camera that is believed shows it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from hrcreplay.geometry.vectors import distance
-from hrcreplay.human.fusion.kalman import Filter, Rules
+from hrcreplay.human.fusion.kalman import SHOWN_NS, Filter, Rules, shows
 from hrcreplay.human.model import LEG_POINTS
 from hrcreplay.kernels import njit
-from hrcreplay.records import FLOOR_Z_M, Bools
+from hrcreplay.records import FLOOR_Z_M, POINTS, Bools
 
-#: Maximum age of the observation of a point, a few frames of any camera; an older hand or leg is unknown [ns].
-SHOWN_NS = 200_000_000
-#: Change of a bone's length beyond which the point at its far end is not on the limb.
-BROKEN = 0.3
-#: Age at which a frame has weight 1/e in the share of the frames with evidence [s].
-_MEMORY_S = 2.0
+#: Change of a leg bone's length beyond which the point at its far end is not on the limb, as a share.
+_BROKEN = 0.3
+#: Age at which a frame has weight 1/e in the share of the frames with evidence [s], and the share that is too much.
+_MEMORY_S, _MOST = 2.0, 0.5
 #: Two cameras show a point in one place up to the first distance, and in two places beyond the second one; between them
 #: is no evidence. The first is what ``logs.camera_checks`` allows for 95 % of a limb's points [m].
 _TOGETHER_M, _APART_M = 0.15, 0.30
-#: Longest time between the captures of two frames that are compared: hands at 2 m/s then move by ``_APART_M`` at most.
+#: Longest time between the captures of two frames that are compared; a hand at 2 m/s moves by less than ``_APART_M``
+#: in it [ns].
 _SAME_TIME_NS = 100_000_000
 #: Depth below the floor of a point that cannot be there; poses of cameras are wrong by some centimetres [m].
 _BELOW_M = 0.10
@@ -73,20 +75,7 @@ def judge(filter_: Filter, c: int, now: int, whole: Bools, rules: Rules) -> None
         gate.disbelieved[c, k] = False
         if shown[k]:
             gate.wrong[c, k] = kept * gate.wrong[c, k] + (1.0 - kept) * against[k]
-            gate.disbelieved[c, k] = gate.wrong[c, k] > 0.5 and _shown_by_another(filter_, c, k, now, rules)
-
-
-@njit(cache=True, inner=True)
-def shows(filter_: Filter, c: int, k: int, rules: Rules) -> bool:
-    """Returns True if the stored frame of a camera shows a point with enough confidence.
-
-    Args:
-        filter_: Contains the frame.
-        c: Index of the camera.
-        k: Index of the point.
-        rules: Settings of the filter.
-    """
-    return bool(filter_.gate.confidence[c, k] >= rules.confidence_min and np.isfinite(filter_.gate.points[c, k, 0]))
+            gate.disbelieved[c, k] = gate.wrong[c, k] > _MOST and _shown_by_another(filter_, c, k, now, rules)
 
 
 @njit(cache=True, inner=True)
@@ -102,7 +91,7 @@ def is_broken(filter_: Filter, c: int, side: int, bone: int) -> bool:
     upper, lower = LEG_POINTS[2 * bone + side], LEG_POINTS[2 * bone + 2 + side]
     length = distance(filter_.gate.points[c, upper], filter_.gate.points[c, lower])
     seen, mean = filter_.model.leg_bones_seen[c, 2 * bone + side], filter_.model.leg_bones[c, 2 * bone + side]
-    return bool(seen >= _BONES_KNOWN and abs(length - mean) > BROKEN * mean)
+    return bool(seen >= _BONES_KNOWN and abs(length - mean) > _BROKEN * mean)
 
 
 @njit(cache=True, inner=True)
@@ -162,6 +151,21 @@ def _shown_by_another(filter_: Filter, c: int, k: int, now: int, rules: Rules) -
     gate = filter_.gate
     for a in range(len(gate.uses)):
         fresh = gate.uses[a] >= 0 and now - gate.capture_ns[a] <= SHOWN_NS
-        if a != c and fresh and gate.wrong[a, k] <= 0.5 and shows(filter_, a, k, rules):
+        if a != c and fresh and gate.wrong[a, k] <= _MOST and shows(filter_, a, k, rules):
             return True
     return False
+
+
+def disbelieved(counts: Mapping[str, int]) -> dict[str, dict[str, int]]:
+    """Returns each camera with points that were not believed, and in how many frames each of them.
+
+    Args:
+        counts: Counts of ``fuse``.
+    """
+    found: dict[str, dict[str, int]] = {}
+    for point in POINTS:
+        stem = f"disbelieved_{point}_"
+        for name in sorted(counts):
+            if name.startswith(stem) and counts[name]:
+                found.setdefault(name.removeprefix(stem), {})[point] = counts[name]
+    return found

@@ -14,6 +14,8 @@ from hrcreplay.records import Bools, Floats, Ints
 
 #: Time before every tick, for events that have not occurred yet [ns].
 NEVER_NS = -(2**62)
+#: Maximum age of the observation of a point, a few frames of any camera; an older hand or leg is unknown [ns].
+SHOWN_NS = 200_000_000
 
 
 class StateEstimate(NamedTuple):
@@ -164,6 +166,19 @@ def delay(filter_: Filter, c: int, now: int, rules: Rules) -> float:
     if not rules.compensate:
         return 0.0
     return max(0.0, min((now - filter_.gate.capture_ns[c]) * 1e-9, rules.delay_max_s))
+
+
+@njit(cache=True, inner=True)
+def shows(filter_: Filter, c: int, k: int, rules: Rules) -> bool:
+    """Returns True if the stored frame of a camera shows a point with enough confidence.
+
+    Args:
+        filter_: Contains the frame.
+        c: Index of the camera.
+        k: Index of the point.
+        rules: Settings of the filter.
+    """
+    return bool(filter_.gate.confidence[c, k] >= rules.confidence_min and np.isfinite(filter_.gate.points[c, k, 0]))
 
 
 @njit(cache=True, inner=True)

@@ -20,8 +20,7 @@ import numpy as np
 
 from hrcreplay.geometry.vectors import distance
 from hrcreplay.human.fusion.body_points import REACH_M, distance_shown, learn, shift
-from hrcreplay.human.fusion.disbelief import shows
-from hrcreplay.human.fusion.kalman import Filter, Rules, delay, extrapolate_back
+from hrcreplay.human.fusion.kalman import Filter, Rules, delay, extrapolate_back, shows
 from hrcreplay.human.model import ARM_POINTS, BENDS, HEAD, HEIGHT, LEFT_ARM, PELVIS, RIGHT_ARM, skeleton_row
 from hrcreplay.kernels import njit
 from hrcreplay.records import BODY, POINTS, Bools, Floats, Ints

@@ -25,6 +25,7 @@ from hrcreplay.egm import motion_link_pb2 as messages
 from hrcreplay.egm.codec import ARM_JOINTS
 from hrcreplay.egm.link import Address, EgmServer, Received
 from hrcreplay.egm.step_gate import StepGate
+from hrcreplay.human.fusion.disbelief import disbelieved
 from hrcreplay.live.control.session_controller import FAULT, REFUSED, SessionController
 from hrcreplay.live.processes import HelperProcess
 from hrcreplay.live.record import codec
@@ -124,6 +125,8 @@ class Loop:
     _strangers: int = 0  # number of other senders that have been reported
     _place: str = ""  # place that has been reported
     _others: bool = False  # whether another body than the first person has been reported
+    _events: int = 0  # number of kinds of events that have been looked at
+    _disbelieved: set[str] = field(default_factory=set)  # cameras that have been reported
 
     def now_ns(self) -> int:
         """The session's clock [ns]: monotonic, and set to Unix time at the start."""
@@ -197,6 +200,7 @@ class Loop:
         for skeleton in skeletons:
             self.recorder.send(codec.encode_skeleton(t_ns, skeleton))
         self._tell_others(perception)
+        self._tell_disbelief()
         if perception is None:
             self.recorder.send(codec.encode_event(t_ns, {"what": "blind"}))
             return
@@ -257,6 +261,20 @@ class Loop:
                 "cameras show another body than the person: by logs.people = nearest the robot keeps clear of one "
                 "person only, the one nearest to the last position"
             )
+
+    def _tell_disbelief(self) -> None:
+        """Reports each camera once whose view of some points is not believed."""
+        counts = self.controller.observer.counts
+        if len(counts) == self._events:  # the first frame of a kind adds its count
+            return
+        self._events = len(counts)
+        for camera, points in disbelieved(counts).items():
+            if camera not in self._disbelieved:
+                self._disbelieved.add(camera)
+                self.note(
+                    f"camera {camera} shows {', '.join(points)} wrong over time, and another camera elsewhere: left "
+                    "out until they agree; look at what hides it from the camera, and at the camera's pose"
+                )
 
     def _signals(self) -> Signal:
         now_ns, found = self.now_ns(), self.caught

@@ -85,6 +85,17 @@ def test_another_body_is_told_once(people: str, told: str) -> None:
     assert tells(note, told)
 
 
+def test_a_camera_that_is_not_believed_is_told_once() -> None:
+    loop = counted(flight := Flight()).fly(1.0)
+    assert not loop.notes
+    flight.controller.observer.counts.update({"disbelieved_foot_l_kinect": 1})
+    loop.fly(0.2)
+    flight.controller.observer.counts.update({"disbelieved_foot_l_kinect": 1, "disbelieved_ankle_l_kinect": 1})
+    loop.fly(0.2)
+    (note,) = loop.notes
+    assert note.startswith("camera kinect shows foot_l wrong over time")
+
+
 def test_no_two_looks_in_a_row_are_left_out() -> None:
     loop = counted(Flight(), work_s=0.0042).fly(1.0)
     assert loop.skipped > 0.4 * loop.answers, "it is always late"
