@@ -12,7 +12,7 @@ import numpy as np
 
 from hrcreplay.geometry.vectors import distance
 from hrcreplay.human.fusion.disbelief import is_broken
-from hrcreplay.human.fusion.kalman import SHOWN_NS, Filter, Rules, shows
+from hrcreplay.human.fusion.kalman import SHOWN_NS, Filter, Rules
 from hrcreplay.human.model import ARM_POINTS, HANDS, HEAD, LEG_POINTS, NECK, PELVIS, skeleton_row, torso_rotation
 from hrcreplay.kernels import njit
 from hrcreplay.records import BODY, LIMBS, POINTS, Bools, Floats
@@ -150,7 +150,7 @@ def _compare_bone(filter_: Filter, c: int, now: int, side: int, bone: int, near:
     if not (near[upper] and near[lower]):
         return
     model, own = filter_.model, 2 * bone + side  # each leg for itself: a whole one does not vouch for the other
-    if is_broken(filter_, c, side, bone):
+    if is_broken(filter_.gate.points[c], model.leg_bones[c], model.leg_bones_seen[c], own):
         if now - model.leg_bones_ns[c, own] <= SHOWN_NS:  # later it is no skeleton that falls apart
             near[lower::2] = False
         return
@@ -163,7 +163,8 @@ def _compare_bone(filter_: Filter, c: int, now: int, side: int, bone: int, near:
 @njit(cache=True, inner=True)
 def _near(filter_: Filter, c: int, k: int, place: Floats, most: float, rules: Rules) -> bool:
     """Returns True if a camera shows a point with enough confidence within ``most`` [m] of a place."""
-    return bool(shows(filter_, c, k, rules) and distance(filter_.gate.points[c, k], place) <= most)
+    shown = filter_.gate.confidence[c, k] >= rules.confidence_min
+    return bool(shown and distance(filter_.gate.points[c, k], place) <= most)
 
 
 @njit(cache=True, inner=True)

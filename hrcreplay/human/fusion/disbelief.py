@@ -19,10 +19,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from hrcreplay.geometry.vectors import distance
-from hrcreplay.human.fusion.kalman import SHOWN_NS, Filter, Rules, shows
+from hrcreplay.human.fusion.kalman import SHOWN_NS, Filter, Rules
 from hrcreplay.human.model import LEG_POINTS
 from hrcreplay.kernels import njit
-from hrcreplay.records import FLOOR_Z_M, POINTS, Bools
+from hrcreplay.records import FLOOR_Z_M, POINTS, Bools, Floats, Ints
 
 #: Change of a leg bone's length beyond which the point at its far end is not on the limb, as a share.
 _BROKEN = 0.3
@@ -51,109 +51,87 @@ def judge(filter_: Filter, c: int, now: int, whole: Bools, rules: Rules) -> None
         whole: (20,) False for points at the end of a bone unlike the person's.
         rules: Settings of the filter.
     """
-    gate = filter_.gate
-    shown = np.zeros(len(whole), np.bool_)
+    gate, model = filter_.gate, filter_.model
+    shown = _find_shown(gate.points, gate.confidence, gate.uses, rules.confidence_min)
+    at_once, believed = shown.copy(), shown & (gate.wrong <= _MOST)
+    for a in range(len(shown)):
+        at_once[a] &= abs(gate.capture_ns[a] - gate.capture_ns[c]) <= _SAME_TIME_NS
+        believed[a] &= a != c and now - gate.capture_ns[a] <= SHOWN_NS
+    against = ~whole
+    for leg in range(4):
+        if is_broken(gate.points[c], model.leg_bones[c], model.leg_bones_seen[c], leg):
+            against[LEG_POINTS[leg + 2 :: 2]] = True
     for k in range(len(whole)):
-        shown[k] = shows(filter_, c, k, rules)
-    against = shown & ~whole
-    for side in range(2):
-        for bone in range(2):
-            if is_broken(filter_, c, side, bone):
-                against[LEG_POINTS[2 * bone + 2 + side :: 2]] = True
-    for k in range(len(whole)):
-        if not shown[k]:
-            continue
-        with_it, elsewhere = _votes(filter_, c, k, rules)
         impossible = against[k] or gate.points[c, k, 2] < FLOOR_Z_M - _BELOW_M
-        against[k] = elsewhere > with_it or (with_it == 1 and impossible)
-    against &= shown
-    if 2 * against.sum() > shown.sum():
+        if impossible or len(shown) > 2:  # one other camera cannot outvote it
+            with_it, elsewhere = _votes(gate.points, at_once, c, k)
+            against[k] = elsewhere > with_it or (with_it == 1 and impossible)
+    against &= shown[c]
+    if 2 * against.sum() > shown[c].sum():
         against[:] = False
     kept = np.exp(-min(now - gate.judged_ns[c], rules.memory_ns) * 1e-9 / _MEMORY_S)
     gate.judged_ns[c] = now
     for k in range(len(whole)):
-        gate.disbelieved[c, k] = False
-        if shown[k]:
+        if shown[c, k]:
             gate.wrong[c, k] = kept * gate.wrong[c, k] + (1.0 - kept) * against[k]
-            gate.disbelieved[c, k] = gate.wrong[c, k] > _MOST and _shown_by_another(filter_, c, k, now, rules)
+        gate.disbelieved[c, k] = shown[c, k] and gate.wrong[c, k] > _MOST and believed[:, k].any()
 
 
 @njit(cache=True, inner=True)
-def is_broken(filter_: Filter, c: int, side: int, bone: int) -> bool:
+def _find_shown(points: Floats, confidence: Floats, uses: Ints, least: float) -> Bools:
+    """(c, 20) True for points that the stored frames of the cameras show with enough confidence.
+
+    Args:
+        points: (c, 20, 3) [m].
+        confidence: (c, 20).
+        uses: (c,) negative without a frame.
+        least: Minimum confidence.
+    """
+    shown = np.zeros(confidence.shape, np.bool_)
+    for a in range(len(shown)):
+        for k in range(confidence.shape[1]):
+            shown[a, k] = uses[a] >= 0 and confidence[a, k] >= least and np.isfinite(points[a, k, 0])
+    return shown
+
+
+@njit(cache=True, inner=True)
+def is_broken(points: Floats, means: Floats, seen: Ints, bone: int) -> bool:
     """Returns True if a camera shows a bone of a leg in a length unlike those before, once they are known.
 
     Args:
-        filter_: Contains the frame, and the mean lengths.
-        c: Index of the camera.
-        side: 0: right, 1: left.
-        bone: 0: thigh, 1: shank.
+        points: (20, 3) of its frame [m].
+        means: (4,) mean lengths of the thighs, then shanks, right and left [m].
+        seen: (4,) number of observations in these.
+        bone: Index of the bone.
     """
-    upper, lower = LEG_POINTS[2 * bone + side], LEG_POINTS[2 * bone + 2 + side]
-    length = distance(filter_.gate.points[c, upper], filter_.gate.points[c, lower])
-    seen, mean = filter_.model.leg_bones_seen[c, 2 * bone + side], filter_.model.leg_bones[c, 2 * bone + side]
-    return bool(seen >= _BONES_KNOWN and abs(length - mean) > _BROKEN * mean)
+    length = distance(points[LEG_POINTS[bone]], points[LEG_POINTS[bone + 2]])
+    return bool(seen[bone] >= _BONES_KNOWN and abs(length - means[bone]) > _BROKEN * means[bone])
 
 
 @njit(cache=True, inner=True)
-def _votes(filter_: Filter, c: int, k: int, rules: Rules) -> tuple[int, int]:
+def _votes(points: Floats, shown: Bools, c: int, k: int) -> tuple[int, int]:
     """Returns how many cameras show a point where camera c does, itself included, and how many agree elsewhere.
 
     Args:
-        filter_: Contains the frames.
+        points: (c, 20, 3) of each camera [m].
+        shown: (c, 20) True for those that are shown at about the time of camera c.
         c: Index of the camera.
         k: Index of the point.
-        rules: Settings of the filter.
     """
-    gate = filter_.gate
     with_it, elsewhere = 1, 0
-    for a in range(len(gate.uses)):
-        if a == c or not _comparable(filter_, a, c, k, rules):
+    for a in range(len(points)):
+        if a == c or not shown[a, k]:
             continue
-        apart = distance(gate.points[a, k], gate.points[c, k])
+        apart = distance(points[a, k], points[c, k])
         if apart <= _TOGETHER_M:
             with_it += 1
         if apart > _APART_M:
             agree = 1
-            for b in range(len(gate.uses)):
-                if b not in (a, c) and _comparable(filter_, b, c, k, rules):
-                    agree += int(distance(gate.points[a, k], gate.points[b, k]) <= _TOGETHER_M)
+            for b in range(len(points)):
+                if b not in (a, c) and shown[b, k]:
+                    agree += int(distance(points[a, k], points[b, k]) <= _TOGETHER_M)
             elsewhere = max(elsewhere, agree)
     return with_it, elsewhere
-
-
-@njit(cache=True, inner=True)
-def _comparable(filter_: Filter, a: int, c: int, k: int, rules: Rules) -> bool:
-    """Returns True if the stored frame of camera a shows a point, at about the time of that of camera c.
-
-    Args:
-        filter_: Contains the frames.
-        a: Index of the one camera.
-        c: Index of the other.
-        k: Index of the point.
-        rules: Settings of the filter.
-    """
-    gate = filter_.gate
-    together = abs(gate.capture_ns[a] - gate.capture_ns[c]) <= _SAME_TIME_NS
-    return gate.uses[a] >= 0 and together and shows(filter_, a, k, rules)
-
-
-@njit(cache=True, inner=True)
-def _shown_by_another(filter_: Filter, c: int, k: int, now: int, rules: Rules) -> bool:
-    """Returns True if a camera whose view of a point is believed shows it.
-
-    Args:
-        filter_: Contains the frames.
-        c: Index of the camera that does not count.
-        k: Index of the point.
-        now: The tick [ns].
-        rules: Settings of the filter.
-    """
-    gate = filter_.gate
-    for a in range(len(gate.uses)):
-        fresh = gate.uses[a] >= 0 and now - gate.capture_ns[a] <= SHOWN_NS
-        if a != c and fresh and gate.wrong[a, k] <= _MOST and shows(filter_, a, k, rules):
-            return True
-    return False
 
 
 def disbelieved(counts: Mapping[str, int]) -> dict[str, dict[str, int]]:

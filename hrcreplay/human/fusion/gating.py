@@ -13,7 +13,7 @@ import numpy as np
 from hrcreplay.geometry.vectors import distance
 from hrcreplay.human.fusion.disbelief import judge
 from hrcreplay.human.fusion.inverse_kinematics import DEPENDS, ROWS
-from hrcreplay.human.fusion.kalman import NEVER_NS, Filter, Rules, Track, delay, extrapolate_back, shows
+from hrcreplay.human.fusion.kalman import NEVER_NS, Filter, Rules, Track, delay, extrapolate_back
 from hrcreplay.human.model import ARM_POINTS, HEAD, HEIGHT, LEFT_ARM, NECK, PELVIS, RIGHT_ARM, skeleton_row
 from hrcreplay.kernels import njit
 from hrcreplay.records import DOF, LENGTHS, POINTS, Bools, Floats
@@ -84,7 +84,7 @@ def validate_frame(filter_: Filter, c: int, now: int, rules: Rules, track: Track
     confidence, points = filter_.gate.confidence[c], filter_.gate.points[c]
     filter_.gate.trusted[c] = False
     for point in _TESTED:
-        if trusted[point] and shows(filter_, c, point, rules):
+        if trusted[point] and confidence[point] >= rules.confidence_min and np.isfinite(points[point, 0]):
             filter_.gate.point_ns[point], filter_.gate.trusted[c, point] = now, True
     for limb in range(len(_PLACING)):
         product, agrees = 1.0, True
@@ -125,7 +125,7 @@ def _agreeing(filter_: Filter, c: int, now: int, whole: Bools, rules: Rules) -> 
     for k in _TESTED:
         lost = now - filter_.gate.point_ns[k] > rules.memory_ns
         agreeing[k] = lost or not distance(points[k], expected[k]) > gate[k]  # or missing
-        shown[k] = shows(filter_, c, k, rules)
+        shown[k] = np.isfinite(points[k, 0]) and filter_.gate.confidence[c, k] >= rules.confidence_min
         there[k] = shown[k] and distance(points[k], expected[k]) <= gate[k]
     for k in _TESTED:
         if not shown[k]:

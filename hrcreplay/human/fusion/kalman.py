@@ -169,19 +169,6 @@ def delay(filter_: Filter, c: int, now: int, rules: Rules) -> float:
 
 
 @njit(cache=True, inner=True)
-def shows(filter_: Filter, c: int, k: int, rules: Rules) -> bool:
-    """Returns True if the stored frame of a camera shows a point with enough confidence.
-
-    Args:
-        filter_: Contains the frame.
-        c: Index of the camera.
-        k: Index of the point.
-        rules: Settings of the filter.
-    """
-    return bool(filter_.gate.confidence[c, k] >= rules.confidence_min and np.isfinite(filter_.gate.points[c, k, 0]))
-
-
-@njit(cache=True, inner=True)
 def predict(mean: Floats, P: Floats, dt: float, damping: float, sigma: Floats, rest_std: Floats) -> None:
     """Eq. (42), (48), (49) over dt seconds, mean (4,) and P (4, 4) in place.
 

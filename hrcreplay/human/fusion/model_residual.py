@@ -20,7 +20,7 @@ import numpy as np
 
 from hrcreplay.geometry.vectors import distance
 from hrcreplay.human.fusion.body_points import REACH_M, distance_shown, learn, shift
-from hrcreplay.human.fusion.kalman import Filter, Rules, delay, extrapolate_back, shows
+from hrcreplay.human.fusion.kalman import Filter, Rules, delay, extrapolate_back
 from hrcreplay.human.model import ARM_POINTS, BENDS, HEAD, HEIGHT, LEFT_ARM, PELVIS, RIGHT_ARM, skeleton_row
 from hrcreplay.kernels import njit
 from hrcreplay.records import BODY, POINTS, Bools, Floats, Ints
@@ -140,7 +140,7 @@ def _farthest(filter_: Filter, c: int, points: Ints, pelvis: Floats, rules: Rule
     farthest = -1.0
     for k in points:
         point = filter_.gate.points[c, k]
-        near = shows(filter_, c, k, rules) and distance(point, pelvis) <= REACH_M
+        near = filter_.gate.confidence[c, k] >= rules.confidence_min and distance(point, pelvis) <= REACH_M
         if near and not filter_.gate.disbelieved[c, k]:
             beyond = point[2] - max(0.0, min(point[2], pelvis[2]))
             off = np.sqrt((point[0] - pelvis[0]) ** 2 + (point[1] - pelvis[1]) ** 2 + beyond**2)
