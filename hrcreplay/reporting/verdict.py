@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hrcreplay.human.fusion.disbelief import disbelieved
 from hrcreplay.records import ALLOWING_CONTACT, LIMBS, RECORDED
 from hrcreplay.reporting.metrics.contact import PERSONS, SHOWN_PARTS, method_prefixes
 from hrcreplay.reporting.metrics.fusion import add_limbs
@@ -182,7 +183,8 @@ def scope(run: Run, metrics: Metrics) -> tuple[str, ...]:
         )
     beside = _beside(run)
     ignored = (*(OTHER_OBJECTS if beside else NO_OBJECTS), *NOT_CONSIDERED, *unseen_limbs(metrics))
-    return (f"{people}.", *_watched(metrics), *programme, *beside, f"Not considered: {', '.join(ignored)}.")
+    considered = (f"{people}.", *_watched(metrics), *_disbelieved(run), *programme, *beside)
+    return (*considered, f"Not considered: {', '.join(ignored)}.")
 
 
 def _beside(run: Run) -> list[str]:
@@ -215,6 +217,16 @@ def _watched(metrics: Metrics) -> list[str]:
             "walk since all cameras showed the area without people"
         )
     return [f"{words}."]
+
+
+def _disbelieved(run: Run) -> list[str]:
+    """Names the points of each camera to which the robot did not react, as there was evidence against them."""
+    return [
+        f"The robot did not react to {', '.join(points)} where camera {camera} showed them, in up to "
+        f"{counted(max(points.values()), 'frame')}: another camera showed them elsewhere, and there was evidence "
+        "against this one. Contact and coverage count them there only if they fit the rest of the body."
+        for camera, points in disbelieved(run.counts).items()
+    ]
 
 
 def unseen_limbs(metrics: Metrics) -> list[str]:

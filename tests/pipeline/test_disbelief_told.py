@@ -1,4 +1,4 @@
-"""A run tells which camera shows which points wrong."""
+"""A run and its verdict tell which camera shows which points wrong."""
 
 from __future__ import annotations
 
@@ -22,9 +22,12 @@ def test_a_run_tells_which_camera_shows_a_foot_below_the_floor(tmp_path: Path) -
     points[mine[:, None], [POINTS.index(name) for name in FOOT]] += down
     frames = replace(made.frames, points_m=points)
     log = crowd.write(tmp_path / "low.mcap", made._replace(frames=frames))
-    told = json.loads((replay.run("fuse", log, out=tmp_path / "run") / "run.json").read_text())
+    out = replay.run("report", log, out=tmp_path / "run", overrides=("plan.baselines=[]",))
+    told = json.loads((out / "run.json").read_text())
     name = crowd.SENSORS[1].name
     (line,) = [note for note in told["notes"] if "wrong over time" in note]
     assert line.startswith(f"camera {name} shows")
     assert all(f"{point} {told['counts'][f'disbelieved_{point}_{name}']}" in line for point in FOOT)
     assert "knee" not in line
+    page = (out / "report.html").read_text()
+    assert f"The robot did not react to ankle_l, foot_l where camera {name} showed them, in up to" in page
