@@ -13,7 +13,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -23,8 +23,8 @@ from llvmlite import binding
 from numba.core import event
 from numba.core.caching import FunctionCache
 
-if "NUMBA_OPT" not in os.environ:  # compiles a tenth faster than level 3; only the fusion is then a fifth slower
-    numba.config.OPT = type(numba.config.OPT)(2)
+if "NUMBA_OPT" not in os.environ:  # compiles a fifth faster than level 3; only the fusion is then a fifth slower
+    numba.config.OPT = type(numba.config.OPT)(1)
 
 #: The packages that contain kernels.
 ROOMS = ("audit", "calibration", "geometry", "human", "robot")
@@ -56,14 +56,14 @@ def njit(*, inner: bool = False, **options: Any) -> Callable[[Any], Any]:
             the process, so a test looks for such calls.
         options: Options of numba.
     """
-    if inner:
-        options |= {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    options |= {"no_cpython_wrapper": inner, "no_cfunc_wrapper": True}  # C calls none of them
 
     def compiled(function: Callable[..., Any]) -> Any:
         others = numba.config.CACHE_DIR
         numba.config.CACHE_DIR = str(folder())  # numba reads it while it decorates the function
         try:
             kernel = numba.njit(**options)(function)
+            kernel.get_call_template = partial(_find_template, kernel.get_call_template)
             if options.get("cache"):
                 _CACHES.append(KernelCache(function))
                 kernel._cache = _CACHES[-1]  # noqa: SLF001 (numba has no public way to choose the cache)
@@ -72,6 +72,12 @@ def njit(*, inner: bool = False, **options: Any) -> Callable[[Any], Any]:
             numba.config.CACHE_DIR = others
 
     return compiled
+
+
+def _find_template(whole: Callable[..., Any], args: tuple[Any, ...], kws: dict[str, Any]) -> Any:
+    """What a kernel calls: the version for any number; numba would compile one more for each number in the source."""
+    plain = tuple(map(numba.types.unliteral, args))
+    return whole(plain, {name: numba.types.unliteral(of) for name, of in kws.items()})
 
 
 @contextmanager

@@ -63,6 +63,20 @@ def people(count: int, until_s: float) -> tuple[Floats, list[Floats]]:
     return t_s, [first[: len(t_s)], *others][:count]
 
 
+def there_and_back(t_s: Floats, bodies: list[Floats], until_s: float) -> tuple[Floats, list[Floats]]:
+    """The motions of people, then backwards, then again, without a leap.
+
+    Args:
+        t_s: (n,) regular instants from 0 [s].
+        bodies: (n, 20, 3) true points of each person, world [m].
+        until_s: Last instant [s].
+    """
+    step_s, last = t_s[1] - t_s[0], len(t_s) - 1
+    ticks = np.arange(int(until_s / step_s) + 1)
+    rows = last - np.abs(last - ticks % (2 * last))
+    return ticks * step_s, [points[rows] for points in bodies]
+
+
 def record(
     t_s: Floats, bodies: list[Floats], seed: int = 5, *, ids: str = "restart", swap_sides: bool = False
 ) -> Crowd:

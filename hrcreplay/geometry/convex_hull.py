@@ -126,7 +126,7 @@ def _turn_outward(vertices: Floats, faces: Ints, neighbors: Ints) -> None:
             faces[f, 0], faces[f, 1] = faces[f, 1], faces[f, 0]
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _runs_same_way(a: Ints, b: Ints) -> bool:
     """Returns True if two triangles have a common edge in the same direction."""
     for i in range(3):

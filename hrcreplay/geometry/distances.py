@@ -67,7 +67,7 @@ def distances(ends: Floats, vertices: Floats, offsets: Ints) -> tuple[Floats, Fl
     return low, high, near
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _distance(
     ends: Floats, vertices: Floats, first: int, last: int, start: int, on: Carriers
 ) -> tuple[float, float, int]:
@@ -107,7 +107,7 @@ def _distance(
     return min(low, high), high, count
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _join(on: Carriers, count: int, code: int, ends: Floats, vertices: Floats) -> int:
     """Adds a difference, with weight 0 unless it is the first; returns the number of carriers."""
     for c in range(3):
@@ -116,7 +116,7 @@ def _join(on: Carriers, count: int, code: int, ends: Floats, vertices: Floats) -
     return count + 1
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _shortest(on: Carriers, count: int) -> int:
     """Moves the weights to the shortest vector of a plane through carriers that lies between them.
 
@@ -142,7 +142,7 @@ def _shortest(on: Carriers, count: int) -> int:
         count = _drop(on, count, leaving)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _drop(on: Carriers, count: int, leaving: int) -> int:
     """Removes a carrier; returns the number left."""
     for i in range(leaving, count - 1):
@@ -152,7 +152,7 @@ def _drop(on: Carriers, count: int, leaving: int) -> int:
     return count - 1
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _plane(on: Carriers, count: int) -> int:
     """Computes the target weights; returns the first carrier in the plane of earlier ones, -1 if none."""
     for i in range(count - 1):
@@ -168,7 +168,7 @@ def _plane(on: Carriers, count: int) -> int:
     return -1
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _edge(on: Carriers, i: int) -> bool:
     """Adds the direction from carrier 0 to i + 1 to the basis, by Gram-Schmidt; False if it lies in the plane."""
     x = on.points[i + 1, 0] - on.points[0, 0]
@@ -214,7 +214,7 @@ def separating_planes(ends: Floats, vertices: Floats, offsets: Ints, wanted: Boo
     return low, normals
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def carriers() -> Carriers:
     """Memory of the kernels."""
     square = np.empty((MOST - 1, MOST - 1))
@@ -223,7 +223,7 @@ def carriers() -> Carriers:
     )
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def separating_plane(
     ends: Floats, vertices: Floats, first: int, last: int, work: Carriers, normal: Floats
 ) -> tuple[float, float]:
@@ -352,7 +352,7 @@ def _nearest_rows(
                         found.at_second_m[i, k] = _at(second[i, b], other, k)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _is_finite(ends: Floats) -> bool:
     total = 0.0
     for k in range(3):
@@ -360,7 +360,7 @@ def _is_finite(ends: Floats) -> bool:
     return math.isfinite(total)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _at(ends: Floats, share: float, k: int) -> float:
     return ends[0, k] + share * (ends[1, k] - ends[0, k])
 
@@ -399,7 +399,7 @@ def segment_distance(first: Floats, second: Floats) -> tuple[float, float, float
     return math.sqrt(least), share, other
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _clipped(along: float, length2: float) -> float:
     """Returns the position along a segment, 0 to 1, at which it is nearest to a point."""
     return min(1.0, max(0.0, along / length2)) if length2 > 0.0 else 0.0

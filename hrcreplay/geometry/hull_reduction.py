@@ -52,7 +52,7 @@ def surface() -> Surface:
     return Surface(np.empty((9, MOST_FACES)), np.empty((9, most), np.int32), np.empty(MOST_SLOTS**2, np.int32))
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def is_inside(x: float, y: float, z: float, count: int, planes: Floats) -> bool:  # noqa: D417
     """Returns True if a point is proven to be inside all triangles.
 
@@ -67,7 +67,7 @@ def is_inside(x: float, y: float, z: float, count: int, planes: Floats) -> bool:
     return outside == 0
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _look(x: float, y: float, z: float, count: int, planes: Floats, faces: Int32s) -> tuple[int, int]:  # noqa: D417
     """Counts the triangles for which a point is not proven to be inside, and those for which it is clearly outside.
 
@@ -84,7 +84,7 @@ def _look(x: float, y: float, z: float, count: int, planes: Floats, faces: Int32
     return outside, beyond
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _set_plane(f: int, i: int, j: int, k: int, size: float, planes: Floats, faces: Int32s) -> None:  # noqa: D417
     """Writes triangle f with corners in slots i, j, k, without joining it to its neighbours.
 
@@ -105,7 +105,7 @@ def _set_plane(f: int, i: int, j: int, k: int, size: float, planes: Floats, face
     faces[A, f], faces[B, f], faces[C, f] = i, j, k
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _join(f: int, width: int, faces: Int32s, owner: Int32s) -> None:  # noqa: D417
     """Makes triangle f the owner of its edges.
 
@@ -118,7 +118,7 @@ def _join(f: int, width: int, faces: Int32s, owner: Int32s) -> None:  # noqa: D4
     owner[k * width + i] = f
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _hide(count: int, faces: Int32s) -> int:
     """Lists the triangles visible from the last tested point; returns their number."""
     hidden = 0
@@ -128,7 +128,7 @@ def _hide(count: int, faces: Int32s) -> int:
     return hidden
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _outline(hidden: int, width: int, faces: Int32s, owner: Int32s) -> int:  # noqa: D417
     """Lists the edges between visible and hidden triangles; returns their number.
 
@@ -166,7 +166,7 @@ def is_loop(edges: int, faces: Int32s) -> bool:
     return back == 0 and corner == start
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _fan(inner: Vector, size: float, count: int, edges: int, slot: int, planes: Floats, faces: Int32s) -> bool:  # noqa: D417
     """Adds triangles from the edges to the point in a slot, not joined yet; returns True if all face outward.
 
@@ -184,7 +184,7 @@ def _fan(inner: Vector, size: float, count: int, edges: int, slot: int, planes: 
     return inward == 0
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _join_all(start: int, end: int, width: int, faces: Int32s, owner: Int32s) -> None:  # noqa: D417
     """Joins new triangles to their neighbours.
 
@@ -197,7 +197,7 @@ def _join_all(start: int, end: int, width: int, faces: Int32s, owner: Int32s) ->
         _join(f, width, faces, owner)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _fill(hidden: int, end: int, width: int, planes: Floats, faces: Int32s, owner: Int32s) -> int:  # noqa: D417
     """Moves the last triangles into the columns of removed ones; returns the number of triangles.
 
@@ -216,7 +216,7 @@ def _fill(hidden: int, end: int, width: int, planes: Floats, faces: Int32s, owne
     return end
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _move(f: int, hole: int, planes: Floats, faces: Int32s) -> None:
     for k in (NX, NY, NZ, OFFSET, ROUNDING, THIN):
         planes[k, hole] = planes[k, f]
@@ -299,7 +299,7 @@ def solid_hull(points: Floats, work: Surface) -> tuple[Ints, Ints]:
     return corners, faces
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _is_thin(planes: Floats) -> bool:
     """Returns True if the first four points of a surface are near a line or a plane, relative to their coordinates."""
     corners = np.ascontiguousarray(planes[X : Z + 1, :4].T)
@@ -309,7 +309,7 @@ def _is_thin(planes: Floats) -> bool:
     return area < least * norm(along) or abs(dot(normal, edge(corners, 0, 3))) < least * area
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _has_sliver(count: int, planes: Floats) -> bool:
     """Returns True if the side test of a triangle may be off by more than ``_THIN_M``."""
     for f in range(count):
@@ -318,7 +318,7 @@ def _has_sliver(count: int, planes: Floats) -> bool:
     return False
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _among(mark: float, marks: Floats, kept: int) -> bool:
     """Returns True if a mark is among the first ones."""
     alike = 0
@@ -327,7 +327,7 @@ def _among(mark: float, marks: Floats, kept: int) -> bool:
     return alike > 0
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _same(points: Floats, kept: int, i: int) -> int:
     """Returns the index at which a point is kept already or would be inserted."""
     for k in range(kept):
@@ -336,7 +336,7 @@ def _same(points: Floats, kept: int, i: int) -> int:
     return kept
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _grow(points: Floats, count: int, work: Surface, keep: Bools) -> tuple[int, int]:
     """Builds the surface and marks the points to keep; returns the numbers of triangles and of slots."""
     size = 0.0
@@ -373,7 +373,7 @@ def _grow(points: Floats, count: int, work: Surface, keep: Bools) -> tuple[int, 
     return faces, slots
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _drop_inner(points: Floats, count: int, faces: int, planes: Floats, triangles: Int32s, keep: Bools) -> None:
     """Drops points that were added, or were near the surface, and are now deep inside; corners of the surface stay."""
     corner = np.zeros(count, np.bool_)
@@ -385,12 +385,12 @@ def _drop_inner(points: Floats, count: int, faces: int, planes: Floats, triangle
             keep[i] = not is_inside(points[i, 0], points[i, 1], points[i, 2], faces, planes)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _mean(along: Floats) -> float:
     return 0.25 * (along[0] + along[1] + along[2] + along[3])
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _seeds_first(points: Floats, count: int) -> Ints:
     """Returns the indices of the points, extreme ones first, so that the surface grows quickly."""
     first = np.zeros(count, np.bool_)
@@ -417,7 +417,7 @@ def _seeds_first(points: Floats, count: int) -> Ints:
     return order
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _simplex(points: Floats, order: Ints, size: float, width: int, work: Surface) -> int:
     """Builds the first surface from four distant points; returns 4, its number of triangles, or 0 for a flat set."""
     a = order[0]
@@ -441,7 +441,7 @@ def _simplex(points: Floats, order: Ints, size: float, width: int, work: Surface
     return 4
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _farthest(points: Floats, a: int, v: Vector, rank: int, count: int) -> int:
     """Finds the point farthest from a point a (1), from the line along v through a (2) or the plane normal to v (3)."""
     best, index = -1.0, a

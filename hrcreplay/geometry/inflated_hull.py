@@ -111,7 +111,7 @@ def _distances(points: Floats, vertices: Floats, faces: Ints) -> Floats:
     return found
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _behind(vertices: Floats) -> float:
     """Distance behind a triangle at which a point counts as clearly behind it [m]."""
     size = 0.0
@@ -149,7 +149,7 @@ def _mark(points: Floats, vertices: Floats, faces: Ints, radius: float, inside: 
             inside[i] = _distance(point, vertices, faces, normals, offsets, behind, radius) <= radius
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _planes(vertices: Floats, faces: Ints) -> tuple[Floats, Floats]:
     """Outward unit normals (f, 3) and their products with a corner (f,); a triangle without area has normal 0."""
     normals, offsets = np.zeros((len(faces), 3)), np.zeros(len(faces))
@@ -170,7 +170,7 @@ def _corner(vertices: Floats, v: int) -> Vector:
     return vertices[v, 0], vertices[v, 1], vertices[v, 2]
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _distance(
     point: Vector,
     vertices: Floats,

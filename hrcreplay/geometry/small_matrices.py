@@ -134,7 +134,7 @@ def singular_values(A: Floats) -> tuple[Floats, Floats, Floats]:
     return U, s[order], V
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _make_orthogonal(rows: Floats, turns: Floats, p: int, q: int) -> bool:
     """Rotates two rows in their plane until they are orthogonal, in place; returns True if they were not."""
     a, b, c = dot_n(rows[p], rows[p]), dot_n(rows[q], rows[q]), dot_n(rows[p], rows[q])
@@ -227,7 +227,7 @@ def nonnegative_least_squares(A: Floats, b: Floats, most: int) -> tuple[Floats, 
     return x, False
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _join_steepest(A: Floats, b: Floats, x: Floats, chosen: Ints, enough: float) -> tuple[Ints, Floats]:
     """Adds the steepest independent column, if any; returns the chosen columns and their solution."""
     rest = b.copy()
@@ -246,7 +246,7 @@ def _join_steepest(A: Floats, b: Floats, x: Floats, chosen: Ints, enough: float)
         slopes[best] = -np.inf
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _leave_first(x: Floats, chosen: Ints, z: Floats) -> Ints:
     """Moves x towards z until the first weight becomes 0, in place; returns the remaining columns."""
     share, leaves = 1.0, 0

@@ -12,25 +12,25 @@ from hrcreplay.records import Floats
 Vector = tuple[float, float, float]
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def edge(points: Floats, i: int, j: int) -> Vector:
     """Vector from point i to point j of (n, 3)."""
     return points[j, 0] - points[i, 0], points[j, 1] - points[i, 1], points[j, 2] - points[i, 2]
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def cross(u: Vector, v: Vector) -> Vector:
     """Vector product."""
     return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def dot(u: Vector, v: Vector) -> float:
     """Scalar product."""
     return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def norm(u: Vector) -> float:
     """Length."""
     return float(np.sqrt(dot(u, u)))
@@ -45,7 +45,7 @@ def dot_n(a: Floats, b: Floats) -> float:
     return total
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def dot3(a: Floats, b: Floats) -> float:
     """Scalar product of 3-vectors in the same order, unrolled: loops over vertices spend most of their time here."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

@@ -147,7 +147,7 @@ def _skeleton_rows(p: Floats, lengths: Floats, points: Floats) -> None:
         skeleton_row(p[i], lengths[i], points[i])
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def skeleton_row(p: Floats, lengths: Floats, points: Floats) -> None:
     """Writes the model's points of one posture, p (13,) and lengths (7,), into points (20, 3) [m]."""
     R = torso_rotation(p[THETA], p[RHO])
@@ -169,7 +169,7 @@ def skeleton_row(p: Floats, lengths: Floats, points: Floats) -> None:
             points[wrist, k] = points[elbow, k] + along_fore * lengths[6 - arm]
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def torso_rotation(theta: float, rho: float) -> Floats:
     """R_torso = Rz(theta) Ry(rho), (3, 3)."""
     ct, st, cr, sr = np.cos(theta), np.sin(theta), np.cos(rho), np.sin(rho)
@@ -178,7 +178,7 @@ def torso_rotation(theta: float, rho: float) -> Floats:
     return R
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def arm_directions(alpha_1: float, alpha_2: float, alpha_3: float, alpha_4: float) -> tuple[Floats, Floats]:
     """Computes unit vectors shoulder to elbow and elbow to wrist in the torso's frame, for a left arm (s = +1).
 
@@ -244,7 +244,7 @@ def _clamp_rows(p: Floats, p_min: Floats, p_max: Floats, coupled: bool) -> None:
         clamp_row(row, p_min, p_max, coupled, low, high)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def clamp_row(p: Floats, p_min: Floats, p_max: Floats, coupled: bool, low: Floats, high: Floats) -> None:
     """Applies Eq. (62) to one posture (13,) in place; writes the applied bounds into low, high (13,).
 
@@ -290,13 +290,13 @@ def nearest(p: Floats, reference: Floats) -> Floats:
     return named
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def wrap(angle: float) -> float:
     """The angle in (-pi, pi] [rad]."""
     return angle - 2.0 * np.pi * np.ceil((angle - np.pi) / (2.0 * np.pi))
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def canonical_arm(arm: Floats, margin: float) -> bool:
     """Converts one arm (4,) in place; returns True if alpha_2 was mirrored, so that its derivatives change sign.
 
@@ -317,7 +317,7 @@ def canonical_arm(arm: Floats, margin: float) -> bool:
     return mirrored
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def nearest_arm(arm: Floats, reference: Floats, variance: Floats) -> None:
     """Converts one arm (4,) in place to the form nearest to the reference (4,), with joints weighted by 1/variance."""
     for j in range(3):
@@ -333,7 +333,7 @@ def nearest_arm(arm: Floats, reference: Floats, variance: Floats) -> None:
             arm[j] = reference[j] + wrap(other[j] - reference[j])
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _into_turn(angle: float, j: int) -> float:
     """Wraps the angle to the turn around the middle of the range of joint j of the arm [rad]."""
     return _MIDDLES[j] + wrap(angle - _MIDDLES[j])

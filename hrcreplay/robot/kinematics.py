@@ -69,13 +69,13 @@ def axis_frames(chain: Chain, q: Floats) -> Floats:
     return found
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _row(row: Floats, local: Floats, column: int) -> float:
     """An element of the product of a rotation's row and the rotation or origin of a frame."""
     return row[0] * local[0, column] + row[1] * local[1, column] + row[2] * local[2, column]
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def segment_ends(chain: Chain, frames: Floats) -> Floats:
     """(s, 2, 3) ends of the segments in the world [m], for the axes' frames."""
     ends = np.empty((len(chain.points_m) // 2, 2, 3))
@@ -96,7 +96,7 @@ def ends_at(chain: Chain, q: Floats) -> Floats:
     return segment_ends(chain, axis_frames(chain, q))
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def tcp_jacobian(chain: Chain, frames: Floats) -> tuple[Floats, Floats]:
     """(4, 4) pose of the TCP [m] and its (6, nv) Jacobian [m/rad, rad/rad], for the axes' frames."""
     nv = len(frames)
@@ -113,7 +113,7 @@ def tcp_jacobian(chain: Chain, frames: Floats) -> tuple[Floats, Floats]:
     return T, J
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _moved(frame: Floats, x: float, y: float, z: float) -> Vector:
     """Velocity of a point of the world that turns about an axis at 1 rad/s [m/s]."""
     return cross((frame[0, 2], frame[1, 2], frame[2, 2]), (x - frame[0, 3], y - frame[1, 3], z - frame[2, 3]))
@@ -144,7 +144,7 @@ def pose_at(chain: Chain, q: Floats, dq: Floats) -> RobotPose:
     return RobotPose(T, J, _drift(frames, T, twist, dq), ends, J_ends, twist)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _drift(frames: Floats, T: Floats, twist: Floats, dq: Floats) -> Floats:
     """(6,) Jdot dq of Eq. (66b), (66c): acceleration of the TCP at zero joint acceleration [m/s^2, rad/s^2].
 

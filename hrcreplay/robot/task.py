@@ -351,7 +351,8 @@ def tcp_speed_limit(grid: Grid, s_s: float) -> float:
 @njit(cache=True)
 def place(grid: Grid, s_s: float) -> tuple[Floats, Floats, Floats]:
     """Position, velocity and acceleration (nv,) each, ``s_s`` seconds of programmed time after a path's start."""
-    q, dq, ddq = np.empty((3, grid.q.shape[1]))
+    nv = grid.q.shape[1]
+    q, dq, ddq = np.empty(nv), np.empty(nv), np.empty(nv)
     write_place(grid, s_s, q, dq, ddq)
     return q, dq, ddq
 

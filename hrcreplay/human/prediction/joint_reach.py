@@ -19,7 +19,7 @@ from hrcreplay.records import Floats
 Stops = tuple[float, float, float, float]
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def saturation_s(v: float, top: float, gain: float, brake: float) -> float:
     """Time at which the fastest velocity profile reaches its bound [s]; inf if it never does.
 
@@ -33,7 +33,7 @@ def saturation_s(v: float, top: float, gain: float, brake: float) -> float:
     return np.inf if a == 0.0 else (top - v) / a
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def fastest(v: float, top: float, gain: float, brake: float, t: float) -> float:
     """The largest velocity at time t of motions that start with at most v.
 
@@ -73,13 +73,13 @@ def rise(v: float, top: float, gain: float, brake: float, horizon: float) -> flo
     return largest
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def braking(v: float, brake: float, horizon: float) -> float:
     """Distance that a joint travels during maximum braking."""
     return rise(v, 0.0, 0.0, brake, horizon) if v > 0.0 else 0.0
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def stops(j: int, bounds: Floats, coupled: bool, low: Floats, high: Floats) -> Stops:
     """Computes the range of the stops of joint j while the joints that they depend on are in [low, high].
 
@@ -109,7 +109,7 @@ def stops(j: int, bounds: Floats, coupled: bool, low: Floats, high: Floats) -> S
     return least, inner_least, inner_most, most
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def interval(
     p: tuple[float, float], v: tuple[float, float], speed: Floats, limit: Stops, horizon: float
 ) -> tuple[float, float]:

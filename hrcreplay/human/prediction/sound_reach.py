@@ -60,7 +60,7 @@ def start_states(states: HumanStates, prediction: Prediction, memory_s: float) -
     return Likely(*(np.ascontiguousarray(a) for a in (states.p, states.v, *off, unseen)))
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def enclose_row(i: int, at: Likely, within: SoundMotionLimits, low: Floats, high: Floats, corners: Floats) -> None:
     """Writes the intervals (13,) of row i, and the corners (SIDES, 2) of the polygon around the pelvis [m].
 
@@ -84,7 +84,7 @@ def enclose_row(i: int, at: Likely, within: SoundMotionLimits, low: Floats, high
             low[j], high[j] = _joint(i, j, at, within, limit)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _joint(i: int, j: int, at: Likely, within: SoundMotionLimits, limit: Stops) -> Range:
     bounds, _, horizon, memory = within
     p, off, unseen = at.p[i, j], at.p_off[i, j], at.unseen_s[i, j]
@@ -99,7 +99,7 @@ def _joint(i: int, j: int, at: Likely, within: SoundMotionLimits, limit: Stops) 
     return interval((p - off, p + off), (v - v_off, v + v_off), bounds[2:, j], limit, horizon)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _walk(i: int, at: Likely, within: SoundMotionLimits, low: Floats, high: Floats, corners: Floats) -> None:
     bounds, _, horizon, memory = within
     p, off, v, v_off = at.p[i, :3], at.p_off[i, :3], at.v[i, :3], at.v_off[i, :3]
@@ -148,7 +148,7 @@ SIDES = 8
 _PIECES = 4
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def rotate_range(x: float, y: float, low: float, high: float) -> Range:
     """Range of x cos(phi) + y sin(phi) for phi in [low, high].
 
@@ -168,7 +168,7 @@ def rotate_range(x: float, y: float, low: float, high: float) -> Range:
     return least, most
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def body_velocity(v: Floats, spread: Floats, heading: Range) -> tuple[Range, Range]:
     """Computes ranges of v and v_perp, Eq. (33), for world velocities in v +- spread (2,) and a range of headings."""
     forward = rotate_range(v[0], v[1], heading[0], heading[1])
@@ -180,7 +180,7 @@ def body_velocity(v: Floats, spread: Floats, heading: Range) -> tuple[Range, Ran
     return (forward[0] - ahead, forward[1] + ahead), (left[0] - aside, left[1] + aside)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def walked(heading: Range, velocity: tuple[Range, Range, Range], bounds: Floats, horizon: float, far: Floats) -> None:
     """Adds to far (SIDES,) the maximum displacement of the pelvis along each side's direction in [0, horizon] [m].
 
@@ -212,14 +212,14 @@ def walked(heading: Range, velocity: tuple[Range, Range, Range], bounds: Floats,
         far[side] += largest[side]
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _turn(omega: Range, bounds: Floats, t: float) -> Range:
     """Largest turn of the heading to the right and to the left at any time until t [rad]."""
     least, most, brake, gain = bounds[2, 2], bounds[3, 2], bounds[4, 2], bounds[5, 2]
     return rise(-omega[0], -least, -brake, -gain, t), rise(omega[1], most, gain, brake, t)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def turn_heading(heading: Range, omega: Range, bounds: Floats, horizon: float) -> Range:
     """Interval of all headings at any time in [0, horizon] [rad].
 
@@ -233,7 +233,7 @@ def turn_heading(heading: Range, omega: Range, bounds: Floats, horizon: float) -
     return heading[0] - turn[0], heading[1] + turn[1]
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _cuts(velocity: tuple[Range, Range, Range], bounds: Floats, horizon: float) -> Floats:
     cuts = np.empty(_PIECES + 5)
     for i in range(_PIECES + 1):
@@ -247,20 +247,20 @@ def _cuts(velocity: tuple[Range, Range, Range], bounds: Floats, horizon: float) 
     return cuts
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _box(velocity: tuple[Range, Range, Range], bounds: Floats, t: float) -> tuple[Range, Range]:
     """Intervals of v and v_perp at time t."""
     ahead, left = velocity[0], velocity[1]
     return _speeds(ahead, bounds, 0, t), _speeds(left, bounds, 1, t)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _speeds(v: Range, bounds: Floats, k: int, t: float) -> Range:
     least, most, brake, gain = bounds[2, k], bounds[3, k], bounds[4, k], bounds[5, k]
     return -fastest(-v[0], -least, -brake, -gain, t), fastest(v[1], most, gain, brake, t)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _farthest(box: tuple[Range, Range], low: float, high: float) -> float:
     """F: maximum of v cos(psi) + v_perp sin(psi) over the box and psi in [low, high]; at a corner, as it is convex."""
     largest = -np.inf
@@ -270,7 +270,7 @@ def _farthest(box: tuple[Range, Range], low: float, high: float) -> float:
     return largest
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def corners_of(far: Floats, ahead: float, corners: Floats) -> None:
     """Writes the corners of the polygon into corners (SIDES, 2); ``ahead``: direction of its first side."""
     step = 2.0 * np.pi / SIDES
@@ -289,13 +289,13 @@ BONE_M = 0.47
 KNEE_M = 0.55
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def knees_out(pelvis_m: float) -> float:
     """Distance of the knees from the line below a pelvis at a height, with the foot below it [m]."""
     return np.sqrt(max(0.0, BONE_M**2 - (0.5 * pelvis_m) ** 2))  # thigh and shank have the same length
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def legs_around(corners: Floats, ahead: float, lowest: float, highest: float, radius: float) -> tuple[Floats, int]:
     """Encloses the legs: from the floor to the highest pelvis over its area, out to the knees of the lowest pelvis.
 

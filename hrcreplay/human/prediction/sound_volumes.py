@@ -197,7 +197,7 @@ def _radii_rows(rows: SoundRows, residual: Floats, rules: SoundRules) -> None:
             found[i, LEGS] = np.fmax(found[i, LEGS], residual[i, LEGS] + (THIGH_M + ROUNDING_M))
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _beside_m(limb: int, points: Floats, modelled: Floats) -> float:
     """Largest offset of a limb's points from the model [m]."""
     most = -np.inf
@@ -251,7 +251,7 @@ def sweep_sound(
     return vertices[:n].copy(), offsets, radii
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _tube(i: int, limb: int, rows: SoundRows, span_s: float, rules: SoundRules, swept: Floats) -> tuple[int, float]:
     """Writes the points of a limb's tube; returns their number and the radius, which includes the limb's [m]."""
     tubed, thick = rows.tubed, rules.body_m[limb]
@@ -272,7 +272,7 @@ def _tube(i: int, limb: int, rows: SoundRows, span_s: float, rules: SoundRules, 
     return count, thick + departs
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _limb(
     limb: int, low: Floats, high: Floats, corners: Floats, lengths: Floats, off: Floats, hand: float, work: Surface
 ) -> tuple[Floats, int]:
@@ -295,7 +295,7 @@ def _limb(
     return _walk(points, count, low[2], high[2], corners)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _turn_all(ends: Floats, chain: Floats, rise: float, work: Surface) -> tuple[Floats, int, int]:
     """Points around what a chain's rotations and a rise of the pelvis make of a limb's ends [m].
 
@@ -329,7 +329,7 @@ def _turn_all(ends: Floats, chain: Floats, rise: float, work: Surface) -> tuple[
     return points, count, faces
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _raised(points: Floats, count: int, rise: float) -> Floats:
     """Returns the first ``count`` points and copies raised by ``rise`` [m]: their hull contains all heights between."""
     both = np.empty((2 * count, 3))
@@ -338,7 +338,7 @@ def _raised(points: Floats, count: int, rise: float) -> Floats:
     return both
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _longest(limb: int, ends: Floats, off: Floats, hand: float) -> Floats:
     """Returns the limb's end points, moved outwards for lengths with an error of up to ``off`` (7,) [m]."""
     if limb == HEAD_LIMB:
@@ -361,7 +361,7 @@ def _longest(limb: int, ends: Floats, off: Floats, hand: float) -> Floats:
     return ends
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _turn(points: Floats, count: int, axis: int, low: float, high: float, radius: float, swept: Floats) -> int:
     far = np.full(len(DIRECTIONS), -np.inf)
     reach_turning(points, count, axis, low, high, far)
@@ -370,7 +370,7 @@ def _turn(points: Floats, count: int, axis: int, low: float, high: float, radius
     return around(far, swept)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _walk(points: Floats, count: int, low: float, high: float, corners: Floats) -> tuple[Floats, int]:
     far = np.full(len(DIRECTIONS), -np.inf)
     reach_turning(points, count, 2, low, high, far)

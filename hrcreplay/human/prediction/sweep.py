@@ -21,7 +21,7 @@ from hrcreplay.records import Floats
 _X, _Y, _Z = 0, 1, 2
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def kinematic_chain(limb: int, low: Floats, high: Floats, lengths: Floats) -> tuple[Floats, Floats]:
     """Returns a limb's end points in the frame of its first rotation, and the rotations up to the human base, Alg. 2.
 
@@ -73,9 +73,7 @@ MOST_COPIES = 8
 
 
 @njit(cache=True)
-def sweep_rot(
-    points: Floats, count: int, axis: int, low: float, high: float, swept: Floats, widest: float = TRIANGLE_RAD
-) -> int:
+def sweep_rot(points: Floats, count: int, axis: int, low: float, high: float, swept: Floats, widest: float) -> int:
     """Rotational sweep about a coordinate axis through the origin, Fig. 8 and Alg. 2: arcs inside triangles.
 
     An arc is divided into equal pieces of at most ``widest``; each lies in the triangle of its ends and the
@@ -109,13 +107,13 @@ def sweep_rot(
     return n
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def copies(low: float, high: float, widest: float = TRIANGLE_RAD) -> int:
     """Maximum number of copies of a point in a rotation."""
     return 1 if low == high else 2 + int(np.ceil(min(high - low, 2.0 * np.pi) / widest))
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def turns(low: float, high: float, cosines: Floats, sines: Floats, widest: float = TRIANGLE_RAD) -> int:
     """Computes the maps of a rotational sweep: rotations, for an apex scaled by 1 / cos(half the piece).
 
@@ -155,7 +153,7 @@ _STEP_M, _OFF_EDGE = 1e-6, 1e-3
 _SAME = 1e-12
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def sweep_walk(
     points: Floats,
     count: int,
@@ -164,7 +162,7 @@ def sweep_walk(
     heading: tuple[float, float],
     floor: Floats,
     swept: Floats,
-    widest: float = TRIANGLE_RAD,
+    widest: float,
 ) -> int:
     """Rotational sweep about the z axis, then a translational one over a polygon, Fig. 7: the end of Alg. 2.
 
@@ -205,7 +203,7 @@ def sweep_walk(
     return n
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _directions(floor: Floats) -> Floats:
     """(k, 4) the two vectors of each place as unit vectors; zero vectors are kept."""
     sides = np.zeros((len(floor), 4))
@@ -218,7 +216,7 @@ def _directions(floor: Floats) -> Floats:
     return sides
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _is_between(away: Cone, k: int, sides: Floats) -> bool:
     """Returns True if a copy is not a corner at a position, by the directions from its set and its turned copies."""
     if away[0] == ALL_ROUND:
@@ -230,7 +228,7 @@ def _is_between(away: Cone, k: int, sides: Floats) -> bool:
     return away[0] == ALL_ROUND
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def box(low: Floats, high: Floats) -> Floats:
     """Makes ``floor`` of ``sweep_walk`` for x and y in separate intervals; an interval of length 0 has one end."""
     wide, deep = 1 + (low[0] < high[0]), 1 + (low[1] < high[1])
@@ -244,7 +242,7 @@ def box(low: Floats, high: Floats) -> Floats:
     return floor
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def polygon(corners: Floats) -> Floats:
     """Makes ``floor`` of ``sweep_walk`` for the hull of corners (k, 2) in order around it [m]."""
     floor = np.empty((len(corners), 6))
@@ -256,7 +254,7 @@ def polygon(corners: Floats) -> Floats:
     return floor
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _away_from_turned(x: float, y: float, copy: int, made: int, cosines: Floats, sines: Floats) -> Cone:
     """Directions from the other turned copies of a point to this one."""
     away = (EMPTY, 0.0, 0.0, 0.0, 0.0)
@@ -269,7 +267,7 @@ def _away_from_turned(x: float, y: float, copy: int, made: int, cosines: Floats,
     return away
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _widen(cone: Cone, x: float, y: float) -> Cone:
     """Adds a direction to the cone; a zero vector is ignored."""
     length = np.sqrt(x * x + y * y)
@@ -278,7 +276,7 @@ def _widen(cone: Cone, x: float, y: float) -> Cone:
     return _widen_to(cone, x / length, y / length)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _widen_to(cone: Cone, x: float, y: float) -> Cone:
     """Adds a unit vector to the cone."""
     kind, ax, ay, bx, by = cone
@@ -296,7 +294,7 @@ def _widen_to(cone: Cone, x: float, y: float) -> Cone:
     return cone
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _steps_inside(points: Floats, count: int, faces: int, work: Surface) -> Floats:
     """(count, 4) two horizontal directions (x, y, x, y); a small step along them, or between them, leads inside.
 
@@ -320,7 +318,7 @@ def _steps_inside(points: Floats, count: int, faces: int, work: Surface) -> Floa
     return steps
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def append(vertices: Floats, n: int, swept: Floats, count: int) -> Floats:
     """Appends vertices behind the first ``n`` rows, in a larger array if needed.
 

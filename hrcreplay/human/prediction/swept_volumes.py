@@ -28,7 +28,15 @@ from hrcreplay.human.model import (
 from hrcreplay.human.prediction.shown_points import SHOWN_S, around_points, bound_by_seen, count_by_points
 from hrcreplay.human.prediction.sound_reach import SoundMotionLimits, enclose, start_states
 from hrcreplay.human.prediction.sound_volumes import SoundRows, SoundRules, sound_rows, sound_rules, sweep_sound
-from hrcreplay.human.prediction.sweep import MOST_COPIES, append, box, kinematic_chain, sweep_rot, sweep_walk
+from hrcreplay.human.prediction.sweep import (
+    MOST_COPIES,
+    TRIANGLE_RAD,
+    append,
+    box,
+    kinematic_chain,
+    sweep_rot,
+    sweep_walk,
+)
 from hrcreplay.kernels import njit
 from hrcreplay.records import BODY, DOF, LIMBS, Bools, Floats, HumanStates, Ints, SweptVolumes, Table
 from hrcreplay.settings.sections import Prediction
@@ -113,7 +121,7 @@ def _reach_rows(p: Floats, v: Floats, never: Bools, within: MotionLimits, low: F
         reach_row(p[i], v[i], never[i], within, low[i], high[i])
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def reach_row(p: Floats, v: Floats, never: Bools, within: MotionLimits, low: Floats, high: Floats) -> None:
     """Writes the reachable interval of every joint from p, v (13,) into low, high (13,).
 
@@ -147,7 +155,7 @@ def reach_row(p: Floats, v: Floats, never: Bools, within: MotionLimits, low: Flo
         _include(p, j, low, high)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _include(p: Floats, j: int, low: Floats, high: Floats) -> None:
     """Eq. (40), the ends sorted first; an interval with a NaN anywhere is NaN at both ends."""
     if np.isnan(p[j] + low[j] + high[j]):
@@ -156,13 +164,13 @@ def _include(p: Floats, j: int, low: Floats, high: Floats) -> None:
         low[j], high[j] = min(p[j], low[j], high[j]), max(p[j], low[j], high[j])
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _joint(p: float, v: float, bounds: Floats, horizon: float) -> tuple[float, float]:
     """Alg. 1, corrected, for one joint; its bounds are v_min, v_max, a_min, a_max."""
     return _farthest(p, v, bounds[0], bounds[2], horizon), _farthest(p, v, bounds[1], bounds[3], horizon)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _farthest(p: float, v: float, v_bound: float, a_bound: float, horizon: float) -> float:
     """Position of a joint that accelerates at its bound until it reaches its velocity bound at T* of Alg. 1."""
     t_star = max(0.0, min((v_bound - v) / a_bound, horizon))  # an estimate over the bound has T* < 0
@@ -171,7 +179,7 @@ def _farthest(p: float, v: float, v_bound: float, a_bound: float, horizon: float
     return p + v * t_star + 0.5 * a_bound * t_star**2 + v_bound * (horizon - t_star)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _walk(p: Floats, v: Floats, bounds: Floats, horizon: float, method: int, low: Floats, high: Floats) -> None:
     """Eq. (18)-(30), corrected: x, y and heading.
 
@@ -197,7 +205,7 @@ def _walk(p: Floats, v: Floats, bounds: Floats, horizon: float, method: int, low
         _include(p, k, low, high)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _sum(start: float, f: float, a: tuple[float, float], g: float, b: tuple[float, float]) -> tuple[float, float]:
     """Interval start + f a + g b."""
     low = start + min(f * a[0], f * a[1]) + min(g * b[0], g * b[1])
@@ -270,6 +278,11 @@ class Predictor:
         return PreparedPerson(self, states, rows)
 
     @cached_property
+    def limbs(self) -> tuple[str, ...]:
+        """Limbs that have volumes."""
+        return limbs_of(self.prediction)
+
+    @cached_property
     def limbs_m(self) -> Floats:
         """(6,) radii of the limbs [m]."""
         return limb_radii(self.prediction)
@@ -304,10 +317,10 @@ class PreparedPerson:
         last, prediction = len(self.states) if last is None else last, self.predictor.prediction
         until_s = np.full(last - first, horizon_s, dtype=np.float64)
         found = self._filtered(until_s, first, last)
-        if self.by_points[first:last].any():
+        if self._has_by_points and self.by_points[first:last].any():
             states = self.states.rows(slice(first, last))
             found = around_points(found, states, prediction, self.predictor.limbs_m, until_s)
-        if self.rows is not None and self.partly_seen[first:last].any():
+        if self.rows is not None and self._has_partly_seen and self.partly_seen[first:last].any():
             rows = np.flatnonzero(self.partly_seen[first:last])
             states, radii_m = self.states.rows(slice(first, last)), self.rows.radii[first:last]
             found = bound_by_seen(found, states, radii_m, rows, prediction, until_s)
@@ -326,6 +339,14 @@ class PreparedPerson:
         lost = self.states.unseen_s[:, THX] > SHOWN_S
         return np.asarray(lost & np.isfinite(self.states.p[:, 0]))
 
+    @cached_property
+    def _has_by_points(self) -> bool:
+        return bool(self.by_points.any())
+
+    @cached_property
+    def _has_partly_seen(self) -> bool:
+        return bool(self.partly_seen.any())
+
     def _filtered(self, horizon_s: Floats, first: int, last: int) -> SweptVolumes:
         """Volumes from the filtered states; unknown for bodies that have none."""
         t_ns, prediction = self.states.t_ns[first:last], self.predictor.prediction
@@ -333,7 +354,7 @@ class PreparedPerson:
             return self._printed(self.states.rows(slice(first, last)), horizon_s)
         span_s, rules, work = horizon_s + prediction.latency_s, self.predictor.rules, self.predictor.work
         vertices, offsets, radii = sweep_sound(self.rows, first, last, span_s, rules, work)
-        return SweptVolumes(t_ns, offsets, vertices, radii, limbs_of(prediction), prediction.method)
+        return SweptVolumes(t_ns, offsets, vertices, radii, self.predictor.limbs, prediction.method)
 
     def _printed(self, states: HumanStates, horizon_s: Floats) -> SweptVolumes:
         limits, method = self.predictor.limits, self.predictor.prediction.method
@@ -370,7 +391,7 @@ def _predict_rows(
     return vertices[:n].copy(), offsets
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _sweep_limb(limb: int, low: Floats, high: Floats, lengths: Floats, work: Surface) -> tuple[Floats, int]:
     """Applies Alg. 2 to one limb, given the reachable intervals (13,) and the lengths (7,)."""
     points, chain = kinematic_chain(limb, low, high, lengths)
@@ -379,7 +400,7 @@ def _sweep_limb(limb: int, low: Floats, high: Floats, lengths: Floats, work: Sur
     count, faces = len(points), 0
     for k, step in enumerate(chain):
         swept = np.empty((MOST_COPIES * count, 3))
-        count = sweep_rot(points, count, int(step[0]), step[1], step[2], swept)
+        count = sweep_rot(points, count, int(step[0]), step[1], step[2], swept, TRIANGLE_RAD)
         points = swept
         for i in range(count):
             for axis in range(3):
@@ -387,7 +408,7 @@ def _sweep_limb(limb: int, low: Floats, high: Floats, lengths: Floats, work: Sur
         if count > _WORTH_REDUCING or k == len(chain) - 1:
             count, faces = keep_corners(points, count, work)
     swept = np.empty((4 * MOST_COPIES * count, 3))
-    count = sweep_walk(points, count, faces, work, (low[2], high[2]), box(low, high), swept)
+    count = sweep_walk(points, count, faces, work, (low[2], high[2]), box(low, high), swept, TRIANGLE_RAD)
     if count > _TOO_MANY:
         count, faces = keep_corners(swept, count, work)
     return swept, count

@@ -109,9 +109,12 @@ def tubes(states: HumanStates, bounded: bool, unknown_m: float, memory_s: float)
         memory_s: Time for which the filter continues without a measurement [s].
     """
     n, shown = len(states), states.camera_points_m
+    if shown is None:
+        shown = np.empty((n, 0, len(POINTS), 3))
+        shown.setflags(write=False)  # like those of a table; otherwise numba compiles the kernels again
     found = Tubes(
         points=np.ascontiguousarray(states.points_m),
-        camera_points=np.empty((n, 0, len(POINTS), 3)) if shown is None else np.ascontiguousarray(shown),
+        camera_points=np.ascontiguousarray(shown),
         residual=np.zeros((n, len(BODY))),
         usable=np.zeros((n, len(BODY)), dtype=np.bool_),
         legs_shown=np.empty(n, dtype=np.bool_),
@@ -160,14 +163,14 @@ def _tube_rows(
             found.legs_m[i] = residual_m[i, LEGS]
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def displaced_m(off: Floats) -> tuple[float, float, float, float, float, float]:
     """Displacement of the far ends of LIMBS by errors (7,) of the lengths up the chain [m]; the own length is apart."""
     shoulder = np.hypot(off[0], off[2])
     return 0.0, 0.0, shoulder, shoulder + off[4], shoulder, shoulder + off[3]
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def departs_m(limb: int, reach_s: float, residual_m: float, speed: float, table: DepartureTable) -> float:
     """Largest departure of a limb until ``reach_s`` [m].
 
@@ -186,7 +189,7 @@ def departs_m(limb: int, reach_s: float, residual_m: float, speed: float, table:
     return max(residual_m, beyond + times * min(residual_m, NOISE_M) + max(0.0, residual_m - NOISE_M))
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _until(reach_s: float, horizon_s: Floats, most_m: Floats) -> float:
     """A row (h,) of the table at ``reach_s`` [m].
 
@@ -200,7 +203,7 @@ def _until(reach_s: float, horizon_s: Floats, most_m: Floats) -> float:
     return found
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _between(reach_s: float, horizon_s: Floats, values: Floats) -> float:
     """A row (h,) of the table at ``reach_s``, linear between the horizons, constant before and after; as np.interp."""
     last = len(horizon_s) - 1
@@ -215,7 +218,7 @@ def _between(reach_s: float, horizon_s: Floats, values: Floats) -> float:
     return slope * (reach_s - horizon_s[k]) + values[k]
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def velocities(p: Floats, v: Floats, lengths: Floats, found: Floats) -> None:
     """Writes the velocities (20, 3) of the model's points [m/s]; NaN for points outside the model.
 
@@ -231,7 +234,7 @@ def velocities(p: Floats, v: Floats, lengths: Floats, found: Floats) -> None:
     found[:] = (later - earlier) / (2.0 * _STEP_S)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def speed_of(limb: int, velocity: Floats) -> float:
     """Speed of the fastest end of a limb; of the legs that of the pelvis [m/s]; ``velocity`` (20, 3) [m/s]."""
     most = 0.0
@@ -261,7 +264,7 @@ def _motion_rows(p: Floats, v: Floats, lengths: Floats, velocity: Floats, speed:
             speed[i, limb] = speed_of(limb, velocity[i])
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def tube(
     limb: int,
     points: Floats,
@@ -306,7 +309,7 @@ def tube(
     return n + rising
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _ends(
     limb: int, points: Floats, shown: Floats, velocity: Floats, span_s: float, hand_m: float, swept: Floats
 ) -> int:
@@ -326,7 +329,7 @@ def _ends(
     return n
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _legs(points: Floats, shown: Floats, velocity: Floats, span_s: float, swept: Floats) -> int:
     n = _add(points[PELVIS], velocity[PELVIS], span_s, swept, 0)
     for c in range(len(shown)):
@@ -349,7 +352,7 @@ def _legs(points: Floats, shown: Floats, velocity: Floats, span_s: float, swept:
     return n
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _lower_arm(
     limb: int, points: Floats, shown: Floats, velocity: Floats, span_s: float, hand_m: float, swept: Floats
 ) -> int:
@@ -371,7 +374,7 @@ def _lower_arm(
     return n
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _add_arm(ends: Floats, elbows: Floats, wrists: Floats, span_s: float, hand_m: float, swept: Floats, n: int) -> int:
     """Writes elbow, wrist and hand (3, 3) [m], with the velocities (3,) of elbow and wrist [m/s]."""
     elbow, wrist, hand = ends[0], ends[1], ends[2]
@@ -389,7 +392,7 @@ def _add_arm(ends: Floats, elbows: Floats, wrists: Floats, span_s: float, hand_m
     return n
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _add(point: Floats, velocity: Floats, span_s: float, swept: Floats, n: int) -> int:
     for i in range(3):
         swept[n, i] = point[i]

@@ -274,7 +274,7 @@ def _kept(arm: Arm, radius: Floats, clearance_m: float) -> Floats:
     return keep
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _check_hulls(
     chain: Chain,
     course: Course,
@@ -309,7 +309,7 @@ def _check_hulls(
     return Unproven(left[:n], results[:n])
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _advance(chain: Chain, course: Course, link: int, hull: Floats, keep: float, plane: Floats, work: Carriers) -> int:
     """Checks one link against a hull by conservative advancement, with planes of ``separating_plane``.
 
@@ -339,7 +339,7 @@ def _advance(chain: Chain, course: Course, link: int, hull: Floats, keep: float,
         row = there
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _check_links(chain: Chain, course: Course, static: StaticShapes, travel: Floats) -> Unproven:
     """Pairs of links that are not proven to keep apart.
 
@@ -370,7 +370,7 @@ def _check_links(chain: Chain, course: Course, static: StaticShapes, travel: Flo
     return Unproven(left[:n], results[:n])
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _apart(first: Floats, second: Floats) -> tuple[float, float]:
     """Bounds of the distance between two segments (2, 3): the gap along the way between nearest points, its length."""
     high, share, other = segment_distance(first, second)
@@ -382,7 +382,7 @@ def _apart(first: Floats, second: Floats) -> tuple[float, float]:
     return _gap(first[0], first[1], normal, second), high
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _make_unit(normal: Floats) -> None:
     """Scales a direction (3,) to length 1, so that ``_gap`` is a bound; a zero vector proves nothing and stays."""
     length = norm_n(normal)
@@ -465,7 +465,7 @@ def _proven(travel: Floats, row: int, gap: float) -> int:
     return there
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _can_be_done(q: Floats, dq: Floats, gain: Floats, dt_s: float) -> bool:
     """Checks that no axis jumps from a row of a motion to the next; false if a number is not finite.
 
@@ -506,7 +506,7 @@ def travel_of(q: Floats, dq: Floats, reach: Floats, dt_s: float) -> Floats:
     return travel
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _undecided(
     ends: Floats, vertices: Floats, offsets: Ints, boxes: Floats, planes: Floats, first: int, far: Floats
 ) -> Ints:
@@ -531,7 +531,7 @@ def _undecided(
     return pairs[:n]
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _pairs_undecided(ends: Floats, pairs: Ints, far: Floats) -> Ints:
     """(n,) pairs of links whose balls around their middles do not prove a distance larger than ``far`` (p,) [m]."""
     found = np.empty(len(pairs), np.int64)

@@ -26,8 +26,7 @@ from hrcreplay.robot.task import Grid, Waits, waits, write_place
 from hrcreplay.settings.sections import Plan
 
 
-@dataclass(frozen=True, slots=True)
-class Stop:
+class Stop(NamedTuple):
     """A motion to rest, one row per tick; it begins at row 0. The robot executes exactly the certified numbers."""
 
     q: Floats  #: (n + 1, nv) [rad]
@@ -155,7 +154,7 @@ def stop_rows(grid: Grid, s_s: float, rate: float, gain: Floats, dt_s: float) ->
     """
     nv = grid.q.shape[1]
     rows_q, rows_dq, along = np.empty((128, nv)), np.empty((128, nv)), np.empty((128, 2))
-    q, towards, bend = np.empty((3, nv))
+    q, towards, bend = np.empty(nv), np.empty(nv), np.empty(nv)
     write_place(grid, s_s, q, towards, bend)
     rows_q[0], rows_dq[0], along[0, 0], along[0, 1] = q, rate * towards, s_s, rate
     i = 0
@@ -180,7 +179,7 @@ def stop_rows(grid: Grid, s_s: float, rate: float, gain: Floats, dt_s: float) ->
     return rows_q[: i + 1], rows_dq[: i + 1], along[: i + 1], i < MOST_TICKS
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _least_rate(towards: Floats, dq: Floats, gain: Floats) -> float:
     """Smallest non-negative rate at which no axis changes its velocity by more than ``gain``."""
     least = 0.0
@@ -219,8 +218,7 @@ NO_HUMAN, NO_SOLUTION, NO_DISTANCE, NOT_FINITE, NOT_CERTIFIED, INSIDE, TOO_NEAR 
 TRACKING, LIMITED, BRAKING, RETREATING = range(4)
 
 
-@dataclass(frozen=True, slots=True)
-class RobotState:
+class RobotState(NamedTuple):
     """Positions and velocities of the axes."""
 
     q: Floats  #: (nv,) [rad]
@@ -241,6 +239,18 @@ class QpRules(NamedTuple):
     give_way_m: float
     soft: bool
     dt_s: float
+
+
+class TickRules(NamedTuple):
+    """Settings of a whole tick of Eq. (66) as numbers for kernels; see ``settings.sections.Plan``."""
+
+    qp: QpRules
+    waits: Waits
+    clearance_m: float
+    lead_s: float
+    tcp_speed_max: float
+    retreat_m: float  #: largest depth inside a volume from which a robot may move out of it [m]
+    certified: bool  #: whether a step must be certified
 
 
 class PathRules(NamedTuple):
@@ -303,6 +313,13 @@ class PlanSettings:
         )
 
     @cached_property
+    def tick_rules(self) -> TickRules:
+        """The settings of a whole tick of Eq. (66) as numbers."""
+        plan = self.plan
+        limits = float(plan.clearance_m), float(plan.lead_s), float(plan.tcp_speed_max), float(self.retreat_m)
+        return TickRules(self.rules, self.waits, *limits, self.certified)
+
+    @cached_property
     def path_rules(self) -> PathRules:
         """The settings of the methods that stay on the path as numbers."""
         plan = self.plan
@@ -331,8 +348,7 @@ class Proposal(NamedTuple):
 Proposals = list[Proposal] | int
 
 
-@dataclass(frozen=True, slots=True)
-class Step:
+class Step(NamedTuple):
     """Decision of the controller in one tick."""
 
     pose: RobotPose  #: at the tick
@@ -351,11 +367,10 @@ class Step:
 
     def beside(self, sight: Sight) -> Step:
         """The step beside the people of an observation."""
-        return replace(self, **nearest_of(sight))
+        return self._replace(**nearest_of(sight))
 
 
-@dataclass(frozen=True, slots=True)
-class Sight:
+class Sight(NamedTuple):
     """The robot and the people at one tick."""
 
     pose: RobotPose
@@ -380,6 +395,18 @@ def observe(robot: RobotModel, state: RobotState, obstacles: Obstacles, clearanc
     """
     hulls = obstacles.vertices_m, obstacles.offsets, obstacles.radius_m
     pose, finite, found = look(robot.arm, state.q, state.dq, *hulls, obstacles.known, clearance_m)
+    return sight_of(pose, finite, found, obstacles)
+
+
+def sight_of(pose: RobotPose, finite: bool, found: NearestLink, obstacles: Obstacles) -> Sight:
+    """The observation from the result of ``look``.
+
+    Args:
+        pose: The robot's pose at the tick.
+        finite: Whether its numbers are finite.
+        found: Distances of all pairs, and the nearest pair.
+        obstacles: The swept volumes of the tick.
+    """
     if not finite or not obstacles.known:
         return Sight(pose, None, math.nan, -1, -1, NO_HUMAN if finite else NOT_FINITE)
     return _sight(pose, found, obstacles)

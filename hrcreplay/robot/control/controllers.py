@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -25,18 +25,23 @@ from hrcreplay.robot.control.control_step import (
     Sight,
     Step,
     Stop,
+    Taken,
+    TickRules,
     at_rest,
     make_step,
     motion_row,
     observe,
     observe_people,
+    sight_of,
     standstill_reason,
 )
 from hrcreplay.robot.control.qp_controller import QpContext
+from hrcreplay.robot.control.qp_tick import QpTick, TickHulls, TickStart, decide_at_once
 from hrcreplay.robot.control.separation import Obstacles, no_obstacles
-from hrcreplay.robot.control.static_obstacles import StaticObstacles
+from hrcreplay.robot.control.static_obstacles import StaticObstacles, StaticShapes, no_shapes
+from hrcreplay.robot.kinematics import Arm
 from hrcreplay.robot.model import RobotModel
-from hrcreplay.robot.task import Reference, ReferencePoint, follow, place
+from hrcreplay.robot.task import Grid, Reference, ReferencePoint, follow, place
 
 
 class ControllerTick(NamedTuple):
@@ -98,28 +103,39 @@ class Controller(ABC):
 
     def step(self, predict: Predict) -> ControllerTick:
         """One tick."""
-        settings, current_stop = self.settings, self.stop
         state, point, now_s = self.state, self.point, self.s_s
         with np.errstate(all="ignore"):  # invalid numbers lead to braking, not to warnings
-            seen = self.observe(predict)
-            proposals = self.propose(seen)
-            seen_until = seen.obstacles, seen.horizon_s
-            taken, self.planes = decide(
-                self.robot, current_stop, proposals, *seen_until, self.planes, settings, self.static
-            )
-        step = make_step(seen.sight, current_stop, taken, seen.horizon_s, settings.dt_s)
+            seen, taken = self.decide(predict)
+        step = make_step(seen.sight, self.stop, taken, seen.horizon_s, self.settings.dt_s)
         self.stop, self.u = step.stop, step.u
         self._move_on()
         return ControllerTick(state, point, now_s, step)
 
+    def decide(self, predict: Predict) -> tuple[Observation, Taken]:
+        """The people at the tick, and the motion that the robot executes."""
+        seen = self.observe(predict)
+        return seen, self._certify(seen, self.propose(seen))
+
+    def _certify(self, seen: Observation, proposals: Proposals) -> Taken:
+        """The first certified proposal, or the stop that continues."""
+        seen_until = seen.obstacles, seen.horizon_s
+        taken, self.planes = decide(
+            self.robot, self.stop, proposals, *seen_until, self.planes, self.settings, self.static
+        )
+        return taken
+
     def observe(self, predict: Predict) -> Observation:
         """The people at the tick, with volumes that are valid until the end of the stop after the step."""
-        horizon_s = self.settings.horizon_s(self.stop)
-        obstacles = predict(horizon_s)
-        horizon_s = min(horizon_s, obstacles.horizon_s)  # a live session may reuse older volumes
+        obstacles, horizon_s = self._volumes(predict)
         return Observation(
             observe(self.robot, self.state, obstacles, self.settings.plan.clearance_m), obstacles, horizon_s, predict
         )
+
+    def _volumes(self, predict: Predict) -> tuple[Obstacles, float]:
+        """The volumes of the tick, and the time from the tick on for which they are valid [s]."""
+        horizon_s = self.settings.horizon_s(self.stop)
+        obstacles = predict(horizon_s)
+        return obstacles, min(horizon_s, obstacles.horizon_s)  # a live session may reuse older volumes
 
     def follow(self, outlook: Outlook, ticks: int) -> list[ControllerTick]:
         """A batch of ticks."""
@@ -137,6 +153,26 @@ class Controller(ABC):
 class QpController(Controller):
     """The trajectory generator of Section 5, along a reference that waits for the robot or runs with the clock."""
 
+    def decide(self, predict: Predict) -> tuple[Observation, Taken]:
+        """The people at the tick, and the motion that the robot executes; in one kernel, see ``qp_tick``."""
+        obstacles, horizon_s = self._volumes(predict)
+        found = decide_at_once(*self._numbers(obstacles, horizon_s))
+        sight = sight_of(found.pose, found.finite, found.nearest, obstacles)
+        seen = Observation(sight, obstacles, horizon_s, predict)
+        self.s_s, self.point = found.s_s, found.point
+        if found.clear:
+            self.planes = found.planes
+            first = qp_controller.proposals_of(found.stops, self.settings, held=found.held)[0]
+            return seen, Taken(first.stop, first.status, 0, certified=True)
+        reason = standstill_reason(sight, self.settings)
+        return seen, self._certify(seen, reason or self._proposals(seen, found))
+
+    def _proposals(self, seen: Observation, found: QpTick) -> Proposals:
+        """The proposals of a tick in which the kernel has certified none."""
+        if found.solved:
+            return qp_controller.proposals_of(found.stops, self.settings, held=found.held)
+        return qp_controller.try_again(self._context(seen, found.rate, found.tcp_speed_max), self.settings)
+
     def propose(self, seen: Observation) -> Proposals:
         """The best step by Eq. (66), and the stop after it."""
         context = self.qp_context(seen)
@@ -148,9 +184,24 @@ class QpController(Controller):
         self.s_s, rate, self.point, cap = follow(
             path.grid, path.model.chain, self.s_s, self.point.T_world_tcp, at, settings.dt_s, settings.waits
         )
-        target = qp_controller.Target(self.point.T_world_tcp, rate * self.point.twist, self.point.q, cap)
+        return self._context(seen, rate, cap)
+
+    def _context(self, seen: Observation, rate: float, tcp_speed_max: float) -> QpContext:
+        """The input of Eq. (66), whose target is the reference."""
+        target = qp_controller.Target(self.point.T_world_tcp, rate * self.point.twist, self.point.q, tcp_speed_max)
         seen_until = seen.sight, seen.obstacles, seen.horizon_s
         return QpContext(self.robot, self.state, self.u, target, *seen_until, self.static)
+
+    def _numbers(
+        self, obstacles: Obstacles, horizon_s: float
+    ) -> tuple[Arm, Grid, TickRules, StaticShapes, TickStart, TickHulls]:
+        """The input of a tick as numbers for the kernel."""
+        robot, static, stop = self.robot, self.static, self.stop
+        shapes = no_shapes(len(robot.segments), robot.nv) if static is None else static.shapes
+        moment = TickStart(stop.q, stop.dq, self.u, self.s_s, self.point.T_world_tcp, self.planes)
+        hulls = obstacles.vertices_m, obstacles.offsets, obstacles.radius_m, obstacles.boxes_m
+        people = TickHulls(*hulls, obstacles.known, horizon_s)
+        return robot.arm, self.reference.grid, self.settings.tick_rules, shapes, moment, people
 
     def _move_on(self) -> None:
         """Does nothing: ``qp_context`` has already advanced the reference."""
@@ -234,7 +285,7 @@ class PflController(PathController):
     def step(self, predict: Predict) -> ControllerTick:
         """One tick."""
         tick = super().step(predict)
-        return tick._replace(step=replace(tick.step, certified=False))
+        return tick._replace(step=tick.step._replace(certified=False))
 
     def observe(self, predict: Predict) -> Observation:
         """The people at the tick: the robot's distances from all of them, and the volumes that it must not touch."""

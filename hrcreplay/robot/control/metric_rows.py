@@ -75,7 +75,7 @@ class Found(NamedTuple):
     key: Ints  #: (4,) indices of the row, as in `worst_rows`
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, inner=True, error_model="numpy")
 def are_numbers_known(H: Floats, g: Floats, limits: Limits, rows: Approach) -> bool:
     """Return whether no number is NaN and only missing bounds are infinite.
 
@@ -93,7 +93,7 @@ def are_numbers_known(H: Floats, g: Floats, limits: Limits, rows: Approach) -> b
     return known
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, inner=True, error_model="numpy")
 def build_metric(H: Floats, g: Floats, limits: Limits, soft: bool, slack_weight: float) -> Metric:
     """Builds the problem without approach rows; NaN if H is not positive definite.
 
@@ -214,7 +214,7 @@ def denied(problem: Metric, z: Floats, limits: Limits) -> bool:
     return least > bound + DENIED
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, inner=True, error_model="numpy")
 def next_row(problem: Metric, y: Floats, limits: Limits, rows: Approach, known: Ints) -> Found:
     """Finds the new approach row that a candidate violates most, in the metric.
 
@@ -258,7 +258,7 @@ def next_row(problem: Metric, y: Floats, limits: Limits, rows: Approach, known: 
     return found_row if outcome == HOPELESS else _with_planes(problem, y, rows, known, found_row, most)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, inner=True, error_model="numpy")
 def _with_planes(problem: Metric, y: Floats, rows: Approach, known: Ints, found: Found, most: float) -> Found:
     """The new row of a plane that a candidate violates most, if it violates it more than ``found``; else ``found``.
 
@@ -295,7 +295,7 @@ def _with_planes(problem: Metric, y: Floats, rows: Approach, known: Ints, found:
     return found
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def join(problem: Metric, known: Ints, found: Found) -> tuple[Metric, Ints]:
     """Adds an approach row; returns the problem and the indices of its approach rows.
 
@@ -309,7 +309,7 @@ def join(problem: Metric, known: Ints, found: Found) -> tuple[Metric, Ints]:
     return more, np.concatenate((known, found.key.reshape(1, -1)))
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _among(known: Ints, key: Ints) -> bool:
     found = False
     for i in range(len(known)):

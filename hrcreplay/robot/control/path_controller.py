@@ -166,7 +166,7 @@ def _propose(
     return done, slowed, q, dq_stop, along
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _largest(
     grid: Grid,
     at: Floats,
@@ -215,7 +215,7 @@ def _largest(
     return found, slowed
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, inner=True, error_model="numpy")
 def _safe_rate(rows: Approach, towards: Floats, rate: float) -> float:
     """The largest rate, up to ``rate``, for which all approach rows hold, Eq. (16); NaN if none is found."""
     for _ in range(ROUNDS):

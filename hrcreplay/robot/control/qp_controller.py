@@ -80,7 +80,7 @@ def joint_bounds(
     return low, high
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def fastest(room: float, gain: float, dt_s: float) -> float:
     """Largest w with S(w) + dt w / 2 <= room, the inverse of a piecewise linear function [rad/s].
 
@@ -273,7 +273,7 @@ def _numbers(context: QpContext, settings: PlanSettings) -> tuple[Arm, QpRules, 
         raise ValueError("problem: the distances from people are not known")
     speed_max = min(plan.tcp_speed_max, RETREAT_SPEED) if settings.retreats(sight.overlap_m) else plan.tcp_speed_max
     hulls = obstacles.vertices_m, obstacles.offsets, obstacles.boxes_m
-    ahead_s = horizon_s + plan.lead_s, static_ahead_s(horizon_s, settings)
+    ahead_s = horizon_s + plan.lead_s, static_ahead_s(horizon_s, plan.smooth_s)
     now = Instant(state.q, state.dq, u_before, target, sight.pose, pairs, *hulls, *ahead_s, speed_max)
     shapes = no_shapes(len(robot.segments), robot.nv) if static is None else static.shapes
     return robot.arm, settings.rules, now, shapes
@@ -306,7 +306,7 @@ def build(arm: Arm, rules: QpRules, now: Instant, static: StaticShapes) -> Probl
     return Problem(H, g, _limits(arm, rules, now), rows, rules.soft)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _limits(arm: Arm, rules: QpRules, now: Instant) -> Limits:
     """The bounds of axes and TCP at one tick, Eq. (66d)-(66h), extended to those of the target velocity."""
     pose, dq, dt_s = now.pose, now.dq, rules.dt_s
@@ -326,7 +326,8 @@ def _limits(arm: Arm, rules: QpRules, now: Instant) -> Limits:
     return limits
 
 
-def static_ahead_s(horizon_s: float, settings: PlanSettings) -> float:
+@njit(cache=True)
+def static_ahead_s(horizon_s: float, smooth_s: float) -> float:
     """Time that the rows of objects and links look ahead [s].
 
     A stop at constant deceleration covers the way of half its duration, and the robot follows its target velocity with
@@ -334,9 +335,9 @@ def static_ahead_s(horizon_s: float, settings: PlanSettings) -> float:
 
     Args:
         horizon_s: Time from the tick on until the end of the stop after the step [s].
-        settings: Settings of the method.
+        smooth_s: ``plan.smooth_s`` [s].
     """
-    return 0.5 * horizon_s + settings.plan.smooth_s
+    return 0.5 * horizon_s + smooth_s
 
 
 #: A TCP that is slower than this has no direction of motion [m/s].
@@ -345,7 +346,7 @@ SLOW_M_PER_S = 1e-6
 SPEED_ROUNDS = 4
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def add_speed_row(limits: Limits, twist: Floats, drift: Floats, speed_max: float, low: Floats, high: Floats) -> Limits:
     """Bounds the TCP's velocity along its direction of motion: the linearised bound on its speed.
 
@@ -376,7 +377,7 @@ def add_speed_row(limits: Limits, twist: Floats, drift: Floats, speed_max: float
     return Limits(limits.low, limits.high, np.concatenate((limits.J, row)), J_low, J_high)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def limit_speed(arm: Arm, rules: QpRules, now: Instant, dq_next: Floats) -> Floats:
     """Moves a proposed velocity towards that of the hardest braking until the TCP keeps its speed limit.
 
@@ -409,7 +410,7 @@ def limit_speed(arm: Arm, rules: QpRules, now: Instant, dq_next: Floats) -> Floa
     return dq
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _speed_and_share(J: Floats, brake: Floats, way: Floats, share: float, allowed: float) -> tuple[float, float]:
     """Speed of the TCP at ``brake + share * way``, and the share in [0, 1] up to which it is at most ``allowed``.
 
@@ -426,13 +427,13 @@ def _speed_and_share(J: Floats, brake: Floats, way: Floats, share: float, allowe
     return math.sqrt(square), min(max(most, 0.0), 1.0)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def dq_after(dq: Floats, aim: Floats, rules: QpRules) -> Floats:
     """(nv,) velocity one tick later of a robot with velocity ``dq`` and target velocity ``aim`` [rad/s]."""
     return dq + (aim - dq) / (1.0 + rules.smooth_s / rules.dt_s) if rules.smooth_s > 0.0 else aim
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def smooth_bounds(low: Floats, high: Floats, steady: Floats, change: Floats) -> tuple[Floats, Floats]:
     """Bounds within which the acceleration changes little, unless the limits of the axes require a larger change.
 
@@ -473,18 +474,31 @@ def stops_after(arm: Arm, rules: QpRules, now: Instant, aim: Floats) -> Stops:
     )
 
 
+@njit(cache=True, inner=True)
+def no_stops(nv: int) -> Stops:
+    """No step, for a robot of ``nv`` axes."""
+    none = np.empty((0, nv)), np.empty((0, nv)), np.empty((0, 2))
+    return Stops(none, none)
+
+
 @njit(cache=True)
-def _propose(arm: Arm, rules: QpRules, now: Instant, static: StaticShapes) -> tuple[bool, bool, Stops]:
-    """Whether ``row_search`` proves the minimiser of Eq. (66), whether a row holds it, and the stops after it."""
+def propose_stops(arm: Arm, rules: QpRules, now: Instant, static: StaticShapes) -> tuple[bool, bool, Stops]:
+    """Whether ``row_search`` proves the minimiser of Eq. (66), whether a row holds it, and the stops after it.
+
+    Args:
+        arm: The manipulator.
+        rules: Weights and limits.
+        now: State, reference and people of the tick.
+        static: Objects of the cell and pairs of links.
+    """
     found = search(build(arm, rules, now, static))
     if found.outcome != SOLVED:
-        none = np.empty((0, len(now.dq)))
-        return False, False, Stops((none, none, none), (none, none, none))
+        return False, False, no_stops(len(now.dq))
     return True, found.held, stops_after(arm, rules, now, found.w)
 
 
 def compile_second_tries(context: QpContext, settings: PlanSettings) -> None:
-    """Compiles the kernels that run only where ``row_search`` proves no solution; see ``propose``."""
+    """Compiles the kernels that run only where ``row_search`` proves no solution; see ``try_again``."""
     numbers = _numbers(context, settings)
     build(*numbers)
     stops_after(*numbers[:3], np.zeros_like(context.state.dq))
@@ -497,18 +511,37 @@ def propose(context: QpContext, settings: PlanSettings) -> Proposals:
         context: Robot, reference and people of the tick.
         settings: Weights and limits.
     """
+    solved, held, stops = propose_stops(*_numbers(context, settings))
+    return proposals_of(stops, settings, held=held) if solved else try_again(context, settings)
+
+
+def try_again(context: QpContext, settings: PlanSettings) -> Proposals:
+    """The proposals where ``row_search`` proves no minimiser: by ProxQP, and without the limit on sudden changes.
+
+    Args:
+        context: Robot, reference and people of the tick.
+        settings: Weights and limits.
+    """
     numbers = _numbers(context, settings)
-    solved, held, stops = _propose(*numbers)
-    if not solved:
-        found = minimise(build(*numbers))
-        if not isinstance(found, Solution) and settings.plan.jerk_s > 0.0:  # a limit may require a sudden change
-            found = minimise(problem(context, settings.without_jerk()))
-        if not isinstance(found, Solution):
-            if found.status == "not finite":
-                return control_step.NOT_FINITE
-            too_fast = settings.retreats(context.sight.overlap_m)  # too fast for a retreat
-            return control_step.INSIDE if too_fast else control_step.NO_SOLUTION
-        held, stops = found.held, stops_after(*numbers[:3], found.dq_next)
+    found = minimise(build(*numbers))
+    if not isinstance(found, Solution) and settings.plan.jerk_s > 0.0:  # a limit may require a sudden change
+        found = minimise(problem(context, settings.without_jerk()))
+    if not isinstance(found, Solution):
+        if found.status == "not finite":
+            return control_step.NOT_FINITE
+        too_fast = settings.retreats(context.sight.overlap_m)  # too fast for a retreat
+        return control_step.INSIDE if too_fast else control_step.NO_SOLUTION
+    return proposals_of(stops_after(*numbers[:3], found.dq_next), settings, held=found.held)
+
+
+def proposals_of(stops: Stops, settings: PlanSettings, *, held: bool) -> list[Proposal]:
+    """The proposals of one solution.
+
+    Args:
+        stops: The stops after it.
+        settings: Whether it must be certified.
+        held: Whether a row of people or objects holds it.
+    """
     status = control_step.LIMITED if held else control_step.TRACKING
     # a straight stop may leave the range of an axis, a stop by Eq. (67) does not
     rows = stops if settings.certified else stops[1:]

@@ -109,7 +109,7 @@ def go_on(task: Problem, problem: Metric, z: Floats, known: Ints, y: Floats) -> 
     return at if at.outcome != UNPROVEN else _add_rows(task, at.problem, at.known)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _add_rows(task: Problem, problem: Metric, known: Ints) -> Search:
     """Moves the candidate and adds rows that it violates, until it violates none."""
     n = len(problem.b)
@@ -130,13 +130,13 @@ def _add_rows(task: Problem, problem: Metric, known: Ints) -> Search:
     return _ended(MANY, problem, np.zeros(len(problem.E)), known)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _ended(outcome: int, problem: Metric, z: Floats, known: Ints) -> Search:
     """The state of a search without a minimiser."""
     return Search(outcome, np.empty(0), 0.0, False, problem, z, known)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _check(task: Problem, problem: Metric, z: Floats, known: Ints, y: Floats) -> Search:
     """The minimiser, if a proven candidate violates no row; UNPROVEN: with the row added that it violates most."""
     limits, fixed = task.limits, len(task.limits.low) + len(task.limits.J)
@@ -151,7 +151,7 @@ def _check(task: Problem, problem: Metric, z: Floats, known: Ints, y: Floats) ->
     return _ended(UNPROVEN, problem, np.append(z, 0.0), known)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _keeps(limits: Limits, w: Floats) -> bool:
     """Return whether a velocity, clipped to the axes' bounds, also keeps the bounds of the TCP."""
     for i in range(len(limits.J)):
@@ -161,7 +161,7 @@ def _keeps(limits: Limits, w: Floats) -> bool:
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _multipliers(problem: Metric, on: Active, count: int) -> Floats:
     """(m,) multipliers of all rows."""
     z = np.zeros(len(problem.E))
@@ -170,7 +170,7 @@ def _multipliers(problem: Metric, on: Active, count: int) -> Floats:
     return z
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _move(problem: Metric, y: Floats, on: Active, count: int) -> tuple[int, bool]:
     """Moves the candidate until it violates no row of the problem.
 
@@ -193,7 +193,7 @@ def _move(problem: Metric, y: Floats, on: Active, count: int) -> tuple[int, bool
     return count, False
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _move_onto(
     problem: Metric, y: Floats, on: Active, count: int, row: int, side: float, violation: float
 ) -> tuple[int, bool]:
@@ -237,7 +237,7 @@ def _move_onto(
     return count, False
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _most_violated(problem: Metric, y: Floats) -> tuple[int, float, float]:
     """The row that a candidate violates most, its side, and by how much; -1 without one."""
     row, side, most = -1, 0.0, VIOLATED
@@ -250,7 +250,7 @@ def _most_violated(problem: Metric, y: Floats) -> tuple[int, float, float]:
     return row, side, most
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _split(on: Active, count: int, normal: Floats, along: Floats, rest: Floats) -> float:
     """Writes the part of a row in the basis of the active rows and the rest of it; returns the length of the rest."""
     rest[:] = normal
@@ -264,7 +264,7 @@ def _split(on: Active, count: int, normal: Floats, along: Floats, rest: Floats) 
     return norm_n(rest)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _solve_upper(triangle: Floats, count: int, right: Floats, x: Floats) -> None:
     """Solves ``triangle @ x = right`` for the first ``count`` rows of an upper triangle."""
     for i in range(count - 1, -1, -1):
@@ -274,7 +274,7 @@ def _solve_upper(triangle: Floats, count: int, right: Floats, x: Floats) -> None
         x[i] /= triangle[i, i]
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _join(
     on: Active, count: int, row: int, side: float, pull: float, along: Floats, rest: Floats, length: float
 ) -> int:
@@ -288,7 +288,7 @@ def _join(
     return count + 1
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _leave(problem: Metric, on: Active, count: int, leaves: int) -> int:
     """Removes an active row; returns the number left."""
     along, rest = np.empty(len(on.rows)), np.empty(len(on.rows))
@@ -299,7 +299,7 @@ def _leave(problem: Metric, on: Active, count: int, leaves: int) -> int:
     return count - 1
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _settle(problem: Metric, y: Floats, on: Active, count: int) -> int:
     """Computes candidate and multipliers of the active rows again, without the errors of the steps; returns ``count``.
 
@@ -320,7 +320,7 @@ def _settle(problem: Metric, y: Floats, on: Active, count: int) -> int:
     return count
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _contradict(on: Active, count: int, row: int, side: float, shares: Floats) -> int:
     """Writes the multipliers with which a row and the active rows contradict each other; returns their number.
 

@@ -285,7 +285,7 @@ def worst_rows(rows: Approach, dq_next: Floats, above_m2: float) -> tuple[Ints, 
     return which[:n], A[:n], values[:n]
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _row(ends: Floats, J_ends: Floats, vertex: Floats, end: int) -> Floats:
     """(nv,) one row of E of Eq. (12), without T_s."""
     row = np.zeros(J_ends.shape[2])
@@ -297,7 +297,7 @@ def _row(ends: Floats, J_ends: Floats, vertex: Floats, end: int) -> Floats:
     return row
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _box_top(box: Floats, v: Floats) -> float:
     """Largest extent of the box along v."""
     top = 0.0
@@ -306,7 +306,7 @@ def _box_top(box: Floats, v: Floats) -> float:
     return top
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _times(J: Floats, dq: Floats) -> Floats:
     v = np.zeros(3)
     for i in range(3):

@@ -188,7 +188,7 @@ def plane_rows(static: StaticShapes, ends: Floats, J_ends: Floats, ahead_s: floa
     return np.concatenate((objects, links)), PlaneRows(np.concatenate((A, B)), np.concatenate((high, low)))
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _object_rows(ends: Floats, J_ends: Floats, static: StaticShapes, ahead_s: float) -> tuple[Ints, Floats, Floats]:
     vertices, offsets, keep = static.vertices, static.offsets, static.keep
     links, hulls = keep.shape
@@ -212,7 +212,7 @@ def _object_rows(ends: Floats, J_ends: Floats, static: StaticShapes, ahead_s: fl
     return which[:n], A[:n], high[:n]
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _link_rows(ends: Floats, J_ends: Floats, pairs: Ints, keep: Floats, ahead_s: float) -> tuple[Ints, Floats, Floats]:
     which, A, high = _no_rows(4 * len(pairs), J_ends.shape[3])
     n, normal = 0, np.empty(3)
@@ -235,13 +235,13 @@ def _link_rows(ends: Floats, J_ends: Floats, pairs: Ints, keep: Floats, ahead_s:
     return which[:n], A[:n], high[:n]
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _no_rows(most: int, nv: int) -> tuple[Ints, Floats, Floats]:
     """Space for rows."""
     return np.empty((most, 4), np.int64), np.zeros((most, nv)), np.empty(most)
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _add(row: Floats, normal: Floats, J: Floats, sign: float) -> None:
     """Adds the speed of a point with the Jacobian J (3, nv) along a normal to a row (nv,)."""
     for j in range(len(row)):
@@ -249,7 +249,7 @@ def _add(row: Floats, normal: Floats, J: Floats, sign: float) -> None:
             row[j] += sign * normal[c] * J[c, j]
 
 
-@njit(cache=True)
+@njit(cache=True, inner=True)
 def _within(ends: Floats, around: Floats, keep: Floats, most: float) -> Bools:
     """(s, o) checked pairs whose boxes are no further apart than the kept distance + ``most`` [m]."""
     links, hulls = keep.shape

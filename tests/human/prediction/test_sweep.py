@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from hrcreplay.human.prediction.sweep import MOST_COPIES, sweep_rot
+from hrcreplay.human.prediction.sweep import MOST_COPIES, TRIANGLE_RAD, sweep_rot
 from hrcreplay.records import Floats
 
 POINT = np.array([[0.4, -0.3, 0.7]])
@@ -13,7 +13,7 @@ POINT = np.array([[0.4, -0.3, 0.7]])
 
 def turned(points: Floats, axis: int, low: float, high: float) -> Floats:
     swept = np.empty((MOST_COPIES * len(points), 3))
-    return swept[: sweep_rot(points, len(points), axis, low, high, swept)]
+    return swept[: sweep_rot(points, len(points), axis, low, high, swept, TRIANGLE_RAD)]
 
 
 def test_a_quarter_turn_by_hand() -> None:

@@ -234,7 +234,7 @@ def test_the_minimiser_keeps_the_rows_of_planes_as_another_solver_does(robot: Ro
         task = problem(context, settings)
         found = minimise(task)
         assert isinstance(found, Solution)
-        _, (A, high) = plane_rows(static.shapes, pose.ends_m, pose.J_ends, static_ahead_s(0.1, settings))
+        _, (A, high) = plane_rows(static.shapes, pose.ends_m, pose.J_ends, static_ahead_s(0.1, settings.plan.smooth_s))
         H, g = task.H, task.g
         limits = np.vstack([np.eye(6), task.limits.J]), np.append(task.limits.high, task.limits.J_high)
         below = np.append(task.limits.low, task.limits.J_low)

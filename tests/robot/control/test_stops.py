@@ -72,7 +72,7 @@ def test_bad_numbers_brake_with_a_reason(robot: RobotModel, where: str, bad: flo
 def test_an_unsolved_qp_is_a_stop(robot: RobotModel, monkeypatch: pytest.MonkeyPatch) -> None:
     seen = obstacles(volumes([np.full((1, 3), 50.0)]), 0)
     state = moving(robot)
-    monkeypatch.setattr(qp_controller, "_propose", lambda *_: (False, False, None))
+    monkeypatch.setattr(qp_controller, "propose_stops", lambda *_: (False, False, None))
     monkeypatch.setattr(qp_controller, "minimise", lambda _: Unsolved("PROXQP_MAX_ITER_REACHED"))
     made = step(robot, state, *swing(robot, 0.0), seen, SETTINGS)
     assert (made.status, made.reason) == (control_step.BRAKING, control_step.NO_SOLUTION)

@@ -1,0 +1,101 @@
+"""One tick of ``qp`` in one kernel: from the people's volumes to the certified step.
+
+A call of a kernel from Python converts every array, which takes as long as much of the work of a tick. So the kernels
+of a tick are called by one kernel here. It gives the numbers of those kernels, bit by bit, and leaves to Python what a
+tick rarely needs: a problem that ``row_search`` does not solve, a motion that is not certified without coal, a retreat,
+and the second proposal.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from hrcreplay.kernels import njit
+from hrcreplay.records import Floats, Ints
+from hrcreplay.robot.control.certificate import RETREAT_SPEED, check
+from hrcreplay.robot.control.control_step import TickRules, look
+from hrcreplay.robot.control.qp_controller import Instant, Stops, Target, no_stops, propose_stops, static_ahead_s
+from hrcreplay.robot.control.separation import NearestLink
+from hrcreplay.robot.control.static_obstacles import StaticShapes
+from hrcreplay.robot.kinematics import Arm, RobotPose
+from hrcreplay.robot.task import Grid, ReferencePoint, follow
+
+
+class TickStart(NamedTuple):
+    """Robot and reference when the tick begins."""
+
+    stop_q: Floats  #: (m, nv) the current stop; row 0 is the state of the robot [rad]
+    stop_dq: Floats  #: (m, nv) [rad/s]
+    u_before: Floats  #: (nv,) acceleration of the previous tick [rad/s^2]
+    s_s: float  #: programmed time of the reference [s]
+    T_world_ref: Floats  #: (4, 4) the reference at that time
+    planes: Floats  #: (s, l + o, 3) planes of the previous tick, as in ``certificate.clear``
+
+
+class TickHulls(NamedTuple):
+    """The swept volumes of a tick, as in ``separation.Obstacles``."""
+
+    vertices: Floats  #: (m, 3) of all limbs [m]
+    offsets: Ints  #: (l + 1,) index of each limb's first vertex
+    radius: Floats  #: (l,) of the limbs' balls [m]
+    boxes: Floats  #: (l, 2, 3) boxes around the limbs' vertices [m]
+    known: bool  #: whether all limbs are known
+    horizon_s: float  #: time from the tick on for which they are valid [s]
+
+
+class QpTick(NamedTuple):
+    """What the kernel found in a tick."""
+
+    pose: RobotPose  #: at the tick
+    finite: bool  #: whether the pose is
+    nearest: NearestLink
+    s_s: float  #: programmed time of the reference at the next tick [s]
+    rate: float  #: of the reference
+    point: ReferencePoint  #: the reference at the next tick
+    tcp_speed_max: float  #: speed limit of the TCP on the way to it [m/s]
+    solved: bool  #: whether ``row_search`` proves the minimiser of Eq. (66)
+    held: bool  #: whether a row of people or objects holds it
+    stops: Stops  #: the stops after it; empty if it is not solved
+    clear: bool  #: whether the first of them is certified
+    planes: Floats  #: for the next tick, if it is
+
+
+@njit(cache=True)
+def decide_at_once(
+    arm: Arm, grid: Grid, rules: TickRules, static: StaticShapes, moment: TickStart, people: TickHulls
+) -> QpTick:
+    """Observes the people, moves the reference, solves Eq. (66) and certifies the first step.
+
+    Args:
+        arm: The manipulator.
+        grid: The programmed path.
+        rules: Weights and limits.
+        static: Objects of the cell and pairs of links.
+        moment: Robot and reference when the tick begins.
+        people: Their volumes.
+    """
+    q, dq, dt_s, clearance_m = moment.stop_q[0], moment.stop_dq[0], rules.qp.dt_s, rules.clearance_m
+    hulls = people.vertices, people.offsets
+    pose, finite, nearest = look(arm, q, dq, *hulls, people.radius, people.known, clearance_m)
+    s_s, rate, point, cap = follow(grid, arm.chain, moment.s_s, moment.T_world_ref, pose.T_world_tcp, dt_s, rules.waits)
+    solved, held, stops, clear, planes = False, False, no_stops(len(q)), False, moment.planes
+    overlap_m = max(0.0, -nearest.surface_m)
+    inside = rules.certified and overlap_m >= rules.retreat_m and nearest.surface_m <= 0.0
+    lost = nearest.pairs.distance_m.size > 0 and math.isnan(nearest.surface_m)
+    if finite and people.known and not lost and not inside:
+        retreats = 0.0 < overlap_m < rules.retreat_m
+        speed_max = min(rules.tcp_speed_max, RETREAT_SPEED) if retreats else rules.tcp_speed_max
+        target = Target(point.T_world_tcp, rate * point.twist, point.q, cap)
+        ahead_s = people.horizon_s + rules.lead_s, static_ahead_s(people.horizon_s, rules.qp.smooth_s)
+        now = Instant(q, dq, moment.u_before, target, pose, nearest.pairs, *hulls, people.boxes, *ahead_s, speed_max)
+        solved, held, stops = propose_stops(arm, rules.qp, now, static)
+        after_q, after_dq, _ = stops.straight
+        in_time = len(after_q) * dt_s <= people.horizon_s + 1e-9
+        if solved and rules.certified and in_time:
+            rows = moment.stop_q, moment.stop_dq, after_q, after_dq
+            done, _, planes, near, beside = check(
+                arm, *rows, *hulls, people.radius, people.boxes, clearance_m, dt_s, planes, static
+            )
+            clear = done and not len(near.pairs) and not len(beside.pairs)
+    return QpTick(pose, finite, nearest, s_s, rate, point, cap, solved, held, stops, clear, planes)
