@@ -21,15 +21,9 @@ from hrcreplay.settings.sections import Plan
 from tests.robot.distances import by_coal
 from tests.robot.people import person
 from tests.robot.swinging import DT_S, STOP_S, base
+from tests.robot.tasks import TO_AND_FRO
 
 TICKS = 600
-TASK = {
-    "name": "to and fro",
-    "repeat": True,
-    "speed": 0.6,
-    "acceleration": 0.5,
-    "waypoints": [{"joints_deg": [40, 20, -10, 0, 60, 0]}, {"joints_deg": [-40, 30, -20, 0, 70, 0]}],
-}
 
 
 @pytest.mark.benchmark
@@ -45,7 +39,7 @@ def test_the_certificate(benchmark: BenchmarkFixture, monkeypatch: pytest.Monkey
 
     monkeypatch.setattr(certificate, "clear", listening)
     controller = QpController(
-        robot, plan_programme(parse_task(TASK), robot), PlanSettings(Plan(), dt_s=DT_S, stop_s=STOP_S)
+        robot, plan_programme(parse_task(TO_AND_FRO), robot), PlanSettings(Plan(), dt_s=DT_S, stop_s=STOP_S)
     )
     monkeypatch.setattr(QpController, "decide", Controller.decide)  # the kernel of the whole tick does not call it
     for tick in range(TICKS):

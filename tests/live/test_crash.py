@@ -25,7 +25,7 @@ from hrcreplay.live.control.stages import Observer
 from hrcreplay.live.record import codec, folder
 from hrcreplay.live.verify import SessionRecomputation
 from hrcreplay.live.view import status
-from hrcreplay.robot.control import control_step
+from hrcreplay.robot.control import control_step, controllers
 from hrcreplay.robot.control.control_step import stop_straight
 from hrcreplay.robot.control.controllers import QpController
 from tests.facts import facts, tells
@@ -38,7 +38,7 @@ from tests.live.sessions import children
 PLACES: dict[str, tuple[Any, str]] = {
     "fusion": (Observer, "update_perception"),
     "controller": (QpController, "step"),
-    "every look": (control_step, "look"),
+    "compiled tick": (controllers, "decide_at_once"),
     "packets": (session_controller, "decode_robot"),
     "conversation": (EgmSession, "classify_all"),
     "reply": (EgmSession, "reply"),

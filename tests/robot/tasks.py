@@ -1,4 +1,4 @@
-"""A robot at an angle, and a pick and place for it."""
+"""A robot at an angle, a pick and place for it, and a turn to and fro."""
 
 from __future__ import annotations
 
@@ -23,6 +23,13 @@ RACK: dict[str, Any] = {
     "dwell_s": 0.3,
 }
 BOX: dict[str, Any] = {"position_m": [0.40, -0.35, 0.15], "quaternion_wxyz": [0, 1, 0, 0], "dwell_s": 0.2}
+TO_AND_FRO: dict[str, Any] = {
+    "name": "to and fro",
+    "repeat": True,
+    "speed": 0.6,
+    "acceleration": 0.5,
+    "waypoints": [{"joints_deg": [40, 20, -10, 0, 60, 0]}, {"joints_deg": [-40, 30, -20, 0, 70, 0]}],
+}
 
 
 @pytest.fixture(scope="module")

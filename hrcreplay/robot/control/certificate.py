@@ -44,8 +44,9 @@ from hrcreplay.robot.control.control_step import (
     Proposal,
     Stop,
     Taken,
+    at_rest,
 )
-from hrcreplay.robot.control.separation import Obstacles
+from hrcreplay.robot.control.separation import Obstacles, no_obstacles
 from hrcreplay.robot.control.static_obstacles import StaticObstacles, StaticShapes, no_shapes
 from hrcreplay.robot.kinematics import Arm, Chain, ends_at
 from hrcreplay.robot.model import RobotModel
@@ -570,7 +571,9 @@ def _gap(a: Floats, b: Floats, normal: Floats, vertices: Floats) -> float:
 
 
 def compile_second_tries(robot: RobotModel) -> None:
-    """Compiles the kernels that run only where ``check`` leaves a pair unproven, so that no session compiles them."""
+    """Compiles `clear` and what it calls where ``check`` leaves a pair unproven, so that no session compiles them."""
+    rest = at_rest(np.zeros(robot.nv))
+    clear(robot, rest, rest, no_obstacles(), 0.0, 1.0, NO_PLANES)
     q, far = np.zeros((2, robot.nv)), np.full((1, 3), 100.0)
     far.setflags(write=False)  # as vertices are
     course = Course(q, q, np.empty((0, 0, 2, 3)), travel_of(q, q, robot.axis_reach_m, 1.0))

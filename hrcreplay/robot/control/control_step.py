@@ -198,7 +198,8 @@ def at_rest(q: Floats, along: Floats | None = None) -> Stop:
         q: (nv,) [rad].
         along: (2,) programmed time and rate on its path; None: the robot is not on a path.
     """
-    return Stop(q[None], np.zeros((1, len(q))), np.full((1, 2), math.nan) if along is None else along[None])
+    # A copy, because q may be read-only, for which numba would compile the kernels again.
+    return Stop(q[None].copy(), np.zeros((1, len(q))), np.full((1, 2), math.nan) if along is None else along[None])
 
 
 #: Reasons why a robot braked or stood still. The first one is for ticks without braking or standing still.

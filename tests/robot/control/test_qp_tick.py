@@ -21,16 +21,10 @@ from hrcreplay.robot.path import plan_programme
 from hrcreplay.robot.task import parse_task
 from hrcreplay.settings.sections import Plan
 from tests.robot.people import person
+from tests.robot.tasks import TO_AND_FRO
 from tests.tools.random_stops import DT_S, TOOL_M, Box, as_static
 
 TICKS, STOP_S = 500, 0.377
-TASK = {
-    "name": "to and fro",
-    "repeat": True,
-    "speed": 0.6,
-    "acceleration": 0.5,
-    "waypoints": [{"joints_deg": [40, 20, -10, 0, 60, 0]}, {"joints_deg": [-40, 30, -20, 0, 70, 0]}],
-}
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +111,7 @@ def test_a_tick_in_one_kernel_is_the_tick_in_python(
 ) -> None:
     how = Plan(**plan)
     settings = PlanSettings(how, dt_s=DT_S, stop_s=STOP_S, certified=certified, retreat_m=how.retreat_m)
-    path = plan_programme(parse_task(TASK), robot)
+    path = plan_programme(parse_task(TO_AND_FRO), robot)
     counts = run(QpController(robot, path, settings, static=beside(robot) if objects else None), approaching())
     assert sum(counts.values()) == TICKS
     at_once = sum(count for (clear, _), count in counts.items() if clear)
@@ -126,7 +120,7 @@ def test_a_tick_in_one_kernel_is_the_tick_in_python(
 
 
 def test_unknown_people_and_nobody_are_those_of_python(robot: RobotModel) -> None:
-    path, near = plan_programme(parse_task(TASK), robot), approaching()
+    path, near = plan_programme(parse_task(TO_AND_FRO), robot), approaching()
     unknown = replace(near[0], known=False)
     outside = replace(near[0], horizon_s=0.001)  # no stop ends in time
     lost = replace(near[0], vertices_m=np.full_like(near[0].vertices_m, np.nan))

@@ -103,3 +103,14 @@ def test_at_rest_there_is_nothing_left() -> None:
     assert stop.ticks == 0
     assert stop.rest() is stop
     np.testing.assert_array_equal(stop.along, [[3.0, 0.0]])
+
+
+def test_the_stop_of_a_robot_at_rest_is_a_copy_that_can_be_written() -> None:
+    """Kernels are compiled for arrays that can be written; a session measures into one that cannot."""
+    q = np.array([0.1, -0.2, 0.3, 0.0, 0.5, -0.6])
+    q.setflags(write=False)
+    stop = at_rest(q)
+    assert stop.q.flags.writeable
+    assert not np.shares_memory(stop.q, q)
+    np.testing.assert_array_equal(stop.q, q[None])
+    np.testing.assert_array_equal(stop.dq, np.zeros((1, 6)))
