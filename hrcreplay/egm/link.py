@@ -65,6 +65,8 @@ _MISSED = 25
 _APART = 0.75
 #: Number of cycles without other packets after which a new session without a pause is accepted.
 _ALONE = 1.5
+#: Largest difference between the rates of the robot's clock and ours, far beyond that of any quartz.
+_DRIFT = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +126,8 @@ class EgmSession:
         self._silence_ns = round(silence_s * 1e9)
         self._cycle_s = cycle_s
         self._last: RobotPacket | None = None  # last accepted packet
-        self._last_ns = self._heard_ns = 0  # arrival of that packet, and of the last answered one
+        self._last_ns = self._heard_ns = 0  # when that packet came, and arrival of the last answered one
+        self._delay_ns: int | None = None  # smallest difference between an arrival and the robot's clock
         self._rival: RobotPacket | None = None  # packet of a possible new session
         self._rival_ns = 0  # arrival of its first packet
         self._alarm = ""  # reason of an alarm since the last answer
@@ -152,7 +155,7 @@ class EgmSession:
             return self._doubt(kind, packet, t_ns)
         if kind in ("new", "again"):
             self._begin(echo=kind == "new")
-        self._last, self._last_ns, self._heard_ns = packet, t_ns, t_ns
+        self._last, self._last_ns, self._heard_ns = packet, self._came_ns(packet, t_ns), t_ns
         self._rival, self._due = None, True
         self.counts["packets"] += 1
         self.counts["lost"] += lost
@@ -238,6 +241,20 @@ class EgmSession:
             kind = JUMPED
         return kind, lost
 
+    def _came_ns(self, packet: RobotPacket, t_ns: int) -> int:
+        """When an accepted packet came [ns]; by the robot's clock, as this computer may have read it late.
+
+        The time in which the axes may have moved until the next packet begins there. If it began when a late packet was
+        read, the next one, which is in time, would seem to hurry.
+        """
+        if packet.clock_ns is None:
+            return t_ns
+        delay_ns = t_ns - packet.clock_ns
+        if self._delay_ns is not None:
+            delay_ns = min(delay_ns, self._delay_ns + round(_DRIFT * (t_ns - self._heard_ns)))
+        self._delay_ns = delay_ns
+        return max(packet.clock_ns + delay_ns, t_ns - self._silence_ns)
+
     def _live(self, t_ns: int) -> bool:
         """Returns True if a robot is being answered."""
         return self._answered and t_ns - self._heard_ns <= self._silence_ns
@@ -289,6 +306,7 @@ class EgmSession:
         """Resets the session. The counter of the answers continues, so that the robot sees no gap."""
         self.counts["sessions"] += 1
         self._fresh = echo
+        self._delay_ns = None
         self._answered = self._ran = False
         self._strained = 0
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hrcreplay.egm.link import JUMPED, OTHER, REASONS, RESTARTED, PacketStatus
-from tests.egm.talks import CYCLE_NS, T0_NS, ZERO, packet, session, talk
+from tests.egm.talks import CYCLE_NS, DQ_MAX, Q_MAX, T0_NS, ZERO, packet, session, talk
 
 
 def test_a_session_begins_once_and_each_packet_is_answered() -> None:
@@ -207,3 +207,34 @@ def test_the_end_is_told() -> None:
     assert talking.classify(packet(2, converged=True), 2 * CYCLE_NS) == PacketStatus(True, True, True, "", True, 0)
     assert talking.classify(packet(3, mci=2), 3 * CYCLE_NS).ended
     assert not talking.classify(packet(0, clock_ns=T0_NS + 4 * CYCLE_NS), 4 * CYCLE_NS).ended
+
+
+@pytest.mark.parametrize("late_cycles", [2, 10, 20])
+def test_a_packet_that_was_read_late_accuses_none_of_those_after_it(late_cycles: int) -> None:
+    """As when a whole computer stands still: a packet waits in the queue, and the next one is sent after the pause."""
+    speed, talking = 0.8 * DQ_MAX, session()
+    sent = [*range(30), *range(30 + late_cycles, 60 + late_cycles)]  # cycles of the robot
+    read = [*range(29), 29 + late_cycles, *range(30 + late_cycles, 60 + late_cycles)]
+    for seqno, (cycle, when) in enumerate(zip(sent, read, strict=True)):
+        q = np.minimum(cycle * CYCLE_NS * 1e-9 * speed, Q_MAX)
+        t_ns = when * CYCLE_NS + 24_000_000  # its clock is another than ours
+        heard = talking.classify(packet(seqno, clock_ns=T0_NS + cycle * CYCLE_NS, q=q), t_ns)
+        assert (heard.answer, heard.reason, heard.lost) == (True, "", 0)
+        talking.reply(ZERO, ZERO, t_ns)
+    ahead = packet(60, clock_ns=T0_NS + (60 + late_cycles + 10) * CYCLE_NS, q=q)
+    assert talking.classify(ahead, (60 + late_cycles) * CYCLE_NS + 24_000_000).reason == RESTARTED
+    jumps = packet(60, clock_ns=T0_NS + (60 + late_cycles) * CYCLE_NS, q=q - 0.5)
+    assert talking.classify(jumps, (60 + late_cycles) * CYCLE_NS + 25_000_000).reason == JUMPED
+
+
+def test_a_clock_that_drifts_from_ours_is_still_known_after_an_hour() -> None:
+    """A tenth of a millisecond in a second, and both senses: no packet is accused, and one that hurries still is."""
+    for drift in (-1e-4, 1e-4):
+        talking = session()
+        for cycle in range(0, 900_000, 20):  # 3600 s, every 20th packet
+            clock_ns = T0_NS + round(cycle * CYCLE_NS * (1.0 + drift))
+            heard = talking.classify(packet(cycle, clock_ns=clock_ns), cycle * CYCLE_NS)
+            assert (heard.answer, heard.reason) == (True, "")
+            talking.reply(ZERO, ZERO, cycle * CYCLE_NS)
+        ahead = packet(cycle + 1, clock_ns=clock_ns + 10 * CYCLE_NS)
+        assert talking.classify(ahead, (cycle + 1) * CYCLE_NS).reason == RESTARTED
