@@ -8,14 +8,16 @@ observed offset from the ankle, or points ahead, and turns with the body: its er
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from hrcreplay.geometry.vectors import distance
 from hrcreplay.human.fusion.disbelief import is_broken
-from hrcreplay.human.fusion.kalman import SHOWN_NS, Filter, Rules
+from hrcreplay.human.fusion.kalman import SHOWN_NS, Filter, Gate, ModelResidual, Rules
 from hrcreplay.human.model import ARM_POINTS, HANDS, HEAD, LEG_POINTS, NECK, PELVIS, skeleton_row, torso_rotation
 from hrcreplay.kernels import njit
-from hrcreplay.records import BODY, LIMBS, POINTS, Bools, Floats
+from hrcreplay.records import BODY, LIMBS, POINTS, Bools, Floats, Ints
 
 #: Maximum distance of a point of a leg from the pelvis: toes of a tall man's straight leg [m].
 REACH_M = 1.2
@@ -46,13 +48,13 @@ _ANKLES, _FEET = (np.array([POINTS.index(f"{part}_{side}") for side in "rl"]) fo
 
 
 @njit(cache=True, inner=True)
-def shift(filter_: Filter, p: Floats, points: Floats) -> None:
-    """Adds the recent offsets to the model's points (20, 3) of a posture p (13,) [m]."""
+def shift(offset: Floats, p: Floats, points: Floats) -> None:
+    """Adds the recent offsets (20, 3) to the model's points (20, 3) of a posture p (13,) [m]."""
     R = torso_rotation(p[2], p[3])
     for k in _BESIDE:
         for i in range(3):
             for j in range(3):
-                points[k, i] += R[i, j] * filter_.model.offset[k, j]
+                points[k, i] += R[i, j] * offset[k, j]
     for i in range(3):
         points[NECK, i] = 0.5 * (points[_SHOULDERS[0], i] + points[_SHOULDERS[1], i])
 
@@ -85,53 +87,85 @@ def learn(
                 beside += R[i, j] * (filter_.gate.points[c, k, i] - model[k, i])
             filter_.model.offset[k, j] += (beside - filter_.model.offset[k, j]) / weight
         filter_.model.offset_weight[k], filter_.model.offset_ns[k] = weight, now
-    _carry_body(filter_, c, model)
+    gate, carried = filter_.gate, _carried(filter_.gate, filter_.model, c)
+    points, seen = gate.points[c], gate.confidence[c] >= rules.confidence_min
+    _carry_body(carried, gate.trusted[c], points, model)
     for n, k in enumerate(HANDS):
-        if filter_.gate.shows[c, _LOWER_ARMS[n]] and _near(
-            filter_, c, k, filter_.gate.points[c, _WRISTS[n]], _HAND_M, rules
-        ):
-            _carry(filter_, c, k, filter_.gate.points[c, k] - shifted[_WRISTS[n]])
+        if gate.shows[c, _LOWER_ARMS[n]] and seen[k] and distance(points[k], points[_WRISTS[n]]) <= _HAND_M:
+            _carry(carried, k, points[k] - shifted[_WRISTS[n]])
     if filter_.gate.valid[c, :2].all():
-        return _learn_legs(filter_, c, now, model[PELVIS], p[2], rules)
+        return _learn_legs(filter_.model, c, now, carried, points, seen, model[PELVIS], p[2])
     return 0
 
 
+class Carried(NamedTuple):
+    """Body points as a camera observed them last, from what they are carried with, and whether its frame is newer."""
+
+    places: Floats  #: (20, 3) [m]
+    seen_ns: Ints  #: (20,) capture of that observation
+    disbelieved: Bools  #: (20,) True for points that the frame shows wrong
+    capture_ns: int  #: of the frame
+
+
 @njit(cache=True, inner=True)
-def _carry_body(filter_: Filter, c: int, model: Floats) -> None:
+def _carried(gate: Gate, model: ModelResidual, c: int) -> Carried:
+    return Carried(model.carried[c], model.carried_ns[c], gate.disbelieved[c], gate.capture_ns[c])
+
+
+@njit(cache=True, inner=True)
+def _carry_body(carried: Carried, trusted: Bools, points: Floats, model: Floats) -> None:
     """Stores where a camera shows the points of the model, from the model (20, 3); the neck between the shoulders."""
-    trusted, points = filter_.gate.trusted[c], filter_.gate.points[c]
     for k in _MODELLED:
         if trusted[k]:
-            _carry(filter_, c, k, points[k] - model[k])
+            _carry(carried, k, points[k] - model[k])
     right, left = _SHOULDER_R, _SHOULDER_L
     if trusted[right] and trusted[left]:
-        _carry(filter_, c, NECK, 0.5 * (points[right] + points[left]) - model[NECK])
+        _carry(carried, NECK, 0.5 * (points[right] + points[left]) - model[NECK])
 
 
 @njit(cache=True, inner=True)
-def _learn_legs(filter_: Filter, c: int, now: int, pelvis: Floats, heading: float, rules: Rules) -> int:
-    """Updates the legs below a pelvis (3,) by a camera's frame [m]; returns the number of points left out."""
+def _learn_legs(
+    residual: ModelResidual,
+    c: int,
+    now: int,
+    carried: Carried,
+    points: Floats,
+    seen: Bools,
+    pelvis: Floats,
+    heading: float,
+) -> int:
+    """Updates the legs below a pelvis by a camera's frame; returns the number of points left out.
+
+    Args:
+        residual: Its mean lengths of the legs' bones and its feet are changed.
+        c: Index of the camera.
+        now: The tick [ns].
+        carried: The points that the camera observed; changed.
+        points: (20, 3) of its frame [m].
+        seen: (20,) True for points with enough confidence.
+        pelvis: (3,) [m].
+        heading: Of the body [rad].
+    """
     near = np.zeros(len(LEG_POINTS), np.bool_)
     for n, k in enumerate(LEG_POINTS):
-        near[n] = _near(filter_, c, k, pelvis, REACH_M, rules)
+        near[n] = seen[k] and distance(points[k], pelvis) <= REACH_M
     found = near.sum()
     for side in range(2):
         for bone in range(2):
-            _compare_bone(filter_, c, now, side, bone, near)
+            _compare_bone(residual, c, now, points, side, bone, near)
     for n, k in enumerate(LEG_POINTS):
         if near[n]:
-            from_below = filter_.gate.points[c, k].copy()
+            from_below = points[k].copy()
             from_below[:2] -= pelvis[:2]
-            _carry(filter_, c, k, from_below)
+            _carry(carried, k, from_below)
     for side in range(2):
         if near[4 + side] and near[6 + side]:
-            ankle, foot = _ANKLES[side], _FEET[side]
-            filter_.model.foot[side] = _turned(filter_.gate.points[c, foot] - filter_.gate.points[c, ankle], -heading)
+            residual.foot[side] = _turned(points[_FEET[side]] - points[_ANKLES[side]], -heading)
     return found - near.sum()
 
 
 @njit(cache=True, inner=True)
-def _compare_bone(filter_: Filter, c: int, now: int, side: int, bone: int, near: Bools) -> None:
+def _compare_bone(model: ModelResidual, c: int, now: int, points: Floats, side: int, bone: int, near: Bools) -> None:
     """Compares a thigh (bone 0) or shank (1) with the mean of the camera, and adds it or rules out what is below.
 
     A bone keeps its length; a skeleton that falls apart before the tracker loses it does not. A new length that stays
@@ -139,9 +173,10 @@ def _compare_bone(filter_: Filter, c: int, now: int, side: int, bone: int, near:
     camera shows the leg all the while (``disbelief``).
 
     Args:
-        filter_: Contains the frame; the mean lengths are changed.
+        model: Its mean lengths are changed.
         c: Index of the camera.
         now: The tick [ns].
+        points: (20, 3) of the frame [m].
         side: 0: right, 1: left.
         bone: 0: thigh, 1: shank.
         near: (8,) True for the points of LEG_POINTS that count; those below a bone of another length are set to False.
@@ -149,50 +184,35 @@ def _compare_bone(filter_: Filter, c: int, now: int, side: int, bone: int, near:
     upper, lower = 2 * bone + side, 2 * bone + 2 + side
     if not (near[upper] and near[lower]):
         return
-    model, own = filter_.model, 2 * bone + side  # each leg for itself: a whole one does not vouch for the other
-    if is_broken(filter_.gate.points[c], model.leg_bones[c], model.leg_bones_seen[c], own):
+    own = 2 * bone + side  # each leg for itself: a whole one does not vouch for the other
+    if is_broken(points, model.leg_bones[c], model.leg_bones_seen[c], own):
         if now - model.leg_bones_ns[c, own] <= SHOWN_NS:  # later it is no skeleton that falls apart
             near[lower::2] = False
         return
-    length = distance(filter_.gate.points[c, LEG_POINTS[upper]], filter_.gate.points[c, LEG_POINTS[lower]])
+    length = distance(points[LEG_POINTS[upper]], points[LEG_POINTS[lower]])
     seen = min(model.leg_bones_seen[c, own] + 1, _BONES_MOST)
     model.leg_bones[c, own] += (length - model.leg_bones[c, own]) / seen
     model.leg_bones_seen[c, own], model.leg_bones_ns[c, own] = seen, now
 
 
 @njit(cache=True, inner=True)
-def _near(filter_: Filter, c: int, k: int, place: Floats, most: float, rules: Rules) -> bool:
-    """Returns True if a camera shows a point with enough confidence within ``most`` [m] of a place."""
-    shown = filter_.gate.confidence[c, k] >= rules.confidence_min
-    return bool(shown and distance(filter_.gate.points[c, k], place) <= most)
+def _carry(carried: Carried, k: int, relative: Floats) -> None:
+    if carried.capture_ns >= carried.seen_ns[k] and not carried.disbelieved[k]:
+        carried.places[k], carried.seen_ns[k] = relative, carried.capture_ns
 
 
 @njit(cache=True, inner=True)
-def _carry(filter_: Filter, c: int, k: int, relative: Floats) -> None:
-    newer = filter_.gate.capture_ns[c] >= filter_.model.carried_ns[c, k]
-    if newer and not filter_.gate.disbelieved[c, k]:
-        filter_.model.carried[c, k], filter_.model.carried_ns[c, k] = relative, filter_.gate.capture_ns[c]
-
-
-@njit(cache=True, inner=True)
-def distance_shown(filter_: Filter, c: int, k: int, plain: Floats, model: Floats, now: int) -> float:
+def distance_shown(point: Floats, start: Floats, along: Floats) -> float:
     """Distance of a point in a camera's frame from where the volumes expect it [m].
 
     That is the line between the model with the recent offsets and where this camera showed the point before, if the two
     are apart: both are in the volumes (``place``).
 
     Args:
-        filter_: Contains the frame.
-        c: Index of the camera.
-        k: Index of the point.
-        plain: (20, 3) the model's points at the capture time [m].
-        model: (20, 3) the same with the recent offsets [m].
-        now: The tick [ns].
+        point: (3,) in the frame [m].
+        start: (3,) of the model with the recent offsets [m].
+        along: (3,) from there to where the camera showed it before; 0 if it has not shown it recently [m].
     """
-    point, start = filter_.gate.points[c, k], model[k]
-    if now - filter_.model.carried_ns[c, k] > SHOWN_NS:
-        return distance(point, start)
-    along = plain[k] + filter_.model.carried[c, k] - start
     apart = np.sqrt((along**2).sum())
     if apart <= ALIKE_M:
         return distance(point, start)
@@ -215,7 +235,7 @@ def place(filter_: Filter, p: Floats, points: Floats, camera_points: Floats) -> 
     """
     skeleton_row(p, filter_.estimate.lengths, points)
     base = points.copy()
-    shift(filter_, p, points)
+    shift(filter_.model.offset, p, points)
     for n, k in enumerate(HANDS):
         base[k] = points[_WRISTS[n]]
     for k in LEG_POINTS:
@@ -228,24 +248,38 @@ def place(filter_: Filter, p: Floats, points: Floats, camera_points: Floats) -> 
     for side in range(2):
         if np.isnan(points[_FEET[side], 0]):
             points[_FEET[side]] = points[_ANKLES[side]] + _turned(filter_.model.foot[side], p[2])
-    _place_shown(filter_, base, points, camera_points)
+    sees_torso = now - filter_.estimate.row_ns[:4].min() <= SHOWN_NS
+    for c in range(len(camera_points)):
+        recent = now - filter_.model.carried_ns[c] <= SHOWN_NS
+        _place_shown(recent, filter_.model.carried[c], base, points, sees_torso, camera_points[c])
 
 
 @njit(cache=True, inner=True)
-def _place_shown(filter_: Filter, base: Floats, points: Floats, camera_points: Floats) -> None:
-    """Writes the points of each camera (c, 20, 3), from what they are carried with, ``base`` (20, 3) [m]."""
-    now = filter_.estimate.tick_ns[0]
-    sees_torso = now - filter_.estimate.row_ns[:4].min() <= SHOWN_NS
-    for c in range(len(camera_points)):
-        for k in _SHOWABLE:
-            if now - filter_.model.carried_ns[c, k] > SHOWN_NS:
-                continue
-            there = base[k] + filter_.model.carried[c, k]
-            apart = distance(there, points[k])
-            if not sees_torso or np.isnan(apart):
-                camera_points[c, k] = there
-            elif apart > ALIKE_M:
-                camera_points[c, k] = there if k in LEG_POINTS else there + (points[k] - there) * (ALIKE_M / apart)
+def _place_shown(
+    recent: Bools, carried: Floats, base: Floats, points: Floats, sees_torso: bool, camera_points: Floats
+) -> None:
+    """Writes the points of a camera.
+
+    Args:
+        recent: (20,) True for points that it has shown recently.
+        carried: (20, 3) these, from ``base`` [m].
+        base: (20, 3) what they are carried with [m].
+        points: (20, 3) of the person [m].
+        sees_torso: Whether a camera has seen the torso recently.
+        camera_points: (20, 3) receives them [m].
+    """
+    there = np.empty(3)
+    for k in _SHOWABLE:
+        if not recent[k]:
+            continue
+        for i in range(3):
+            there[i] = base[k, i] + carried[k, i]
+        apart = distance(there, points[k])
+        if not sees_torso or np.isnan(apart) or (apart > ALIKE_M and k in LEG_POINTS):
+            camera_points[k] = there
+        elif apart > ALIKE_M:
+            for i in range(3):
+                camera_points[k, i] = there[i] + (points[k, i] - there[i]) * (ALIKE_M / apart)
 
 
 @njit(cache=True, inner=True)

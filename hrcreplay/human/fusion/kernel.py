@@ -10,9 +10,20 @@ import numpy as np
 from hrcreplay.human.fusion.body_points import place
 from hrcreplay.human.fusion.gating import validate_frame
 from hrcreplay.human.fusion.inverse_kinematics import ROWS
-from hrcreplay.human.fusion.kalman import Filter, Frames, Rules, Track, correct, delay, dot, predict
+from hrcreplay.human.fusion.kalman import (
+    Filter,
+    Frames,
+    Gate,
+    Rules,
+    StateEstimate,
+    Track,
+    correct,
+    delay,
+    dot,
+    predict,
+)
 from hrcreplay.human.fusion.model_residual import observe, write_residual, write_unseen_times
-from hrcreplay.human.fusion.reported_deviations import add_innovation, autocorrelation, reset, variance_factor
+from hrcreplay.human.fusion.reported_deviations import add_innovation, autocorrelation, reset, write_deviations
 from hrcreplay.human.model import LEFT_ARM, RIGHT_ARM, canonical_arm, clamp_row, nearest_arm, wrap
 from hrcreplay.kernels import njit
 from hrcreplay.records import DOF, Floats, Ints
@@ -42,8 +53,8 @@ def run(ticks_ns: Ints, frames: Frames, filter_: Filter, rules: Rules, track: Tr
         now = ticks_ns[k]
         dt = (now - filter_.estimate.tick_ns[0]) * 1e-9 if filter_.estimate.started[0] else 0.0
         if filter_.estimate.started[0]:
-            _predict(filter_, now, rules, damping)
-        seen = _collect(frames, seen, now, filter_, track)
+            _predict(filter_.estimate, now, rules, damping)
+        seen = _collect(frames, seen, now, filter_.gate, track.superseded)
         fresh = filter_.gate.uses == 0
         for c in range(len(fresh)):
             if fresh[c]:
@@ -56,40 +67,40 @@ def run(ticks_ns: Ints, frames: Frames, filter_: Filter, rules: Rules, track: Tr
                 track.valid[k, c] = _update(filter_, c, now, rules, track)
         filter_.estimate.tick_ns[0] = now
         if filter_.estimate.started[0]:
-            _rename(filter_)
+            _rename(filter_.estimate.mean)
             if saturate(filter_.estimate.mean, dt, rules):
                 track.saturated[0] += 1
             _leave(filter_, k, rules, track, damping)
 
 
 @njit(cache=True, inner=True)
-def _predict(filter_: Filter, now: int, rules: Rules, damping: Floats) -> None:
+def _predict(estimate: StateEstimate, now: int, rules: Rules, damping: Floats) -> None:
     """Computes the a-priori estimate, Eq. (48), (49).
 
     A joint unseen for longer than ``coast_ns`` decelerates to rest, as a polynomial with jerk diverges.
     """
-    dt = (now - filter_.estimate.tick_ns[0]) * 1e-9
+    dt = (now - estimate.tick_ns[0]) * 1e-9
     for j in range(DOF):
-        damping[j] = np.exp(-dt / rules.rest_s) if now - filter_.estimate.row_ns[j] > rules.coast_ns else 1.0
-        predict(filter_.estimate.mean[j], filter_.estimate.cov[j], dt, damping[j], rules.sigma[j], rules.rest_std[j])
+        damping[j] = np.exp(-dt / rules.rest_s) if now - estimate.row_ns[j] > rules.coast_ns else 1.0
+        predict(estimate.mean[j], estimate.cov[j], dt, damping[j], rules.sigma[j], rules.rest_std[j])
 
 
 @njit(cache=True, inner=True)
-def _collect(frames: Frames, seen: int, now: int, filter_: Filter, track: Track) -> int:
+def _collect(frames: Frames, seen: int, now: int, gate: Gate, superseded: Ints) -> int:
     """Stores the newest arrived frame of each camera; returns the number of frames processed."""
     while seen < len(frames.arrival_ns) and frames.arrival_ns[seen] <= now:
         c = frames.camera[seen]
-        waiting = filter_.gate.uses[c] == 0
-        late = filter_.gate.uses[c] >= 0 and frames.capture_ns[seen] < filter_.gate.capture_ns[c]
+        waiting = gate.uses[c] == 0
+        late = gate.uses[c] >= 0 and frames.capture_ns[seen] < gate.capture_ns[c]
         if waiting or late:
-            track.superseded[c] += 1
+            superseded[c] += 1
         if not late:
-            filter_.gate.capture_ns[c] = frames.capture_ns[seen]
-            filter_.gate.uses[c] = 0
-            filter_.gate.z[c] = frames.z[seen]
-            filter_.gate.z_var[c] = frames.z_var[seen]
-            filter_.gate.points[c] = frames.points[seen]
-            filter_.gate.confidence[c] = frames.confidence[seen]
+            gate.capture_ns[c] = frames.capture_ns[seen]
+            gate.uses[c] = 0
+            gate.z[c] = frames.z[seen]
+            gate.z_var[c] = frames.z_var[seen]
+            gate.points[c] = frames.points[seen]
+            gate.confidence[c] = frames.confidence[seen]
         seen += 1
     return seen
 
@@ -122,12 +133,12 @@ def _update(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> bo
                 filter_.estimate.lengths[row - DOF] += gain * (z[row] - filter_.estimate.lengths[row - DOF])
                 filter_.estimate.lengths_var[row - DOF] *= 1.0 - gain
         elif now - filter_.estimate.row_ns[row] > rules.memory_ns:
-            _acquire(filter_, row, z[row], R, rules.rest_std[row])
+            _acquire(filter_.estimate, row, z[row], R, rules.rest_std[row])
             filter_.estimate.acquired_ns[row] = now
             track.reacquired[0] += filter_.estimate.row_ns[row] >= 0  # the first time is not a reacquisition
         else:
             innovation = correct(filter_.estimate.mean[row], filter_.estimate.cov[row], h, z[row], R)
-            add_innovation(filter_, c, row, innovation, now, rules)
+            add_innovation(filter_.estimate, c, row, innovation, now, rules.spread_memory_s)
         if filter_.gate.uses[c] == 1:
             filter_.estimate.row_ns[row] = now
     filter_.gate.newest_ns[0] = max(filter_.gate.newest_ns[0], filter_.gate.capture_ns[c])
@@ -162,25 +173,25 @@ def _start(filter_: Filter, c: int) -> None:
 
 
 @njit(cache=True, inner=True)
-def _acquire(filter_: Filter, j: int, z: float, R: float, rest_std: Floats) -> None:
+def _acquire(estimate: StateEstimate, j: int, z: float, R: float, rest_std: Floats) -> None:
     """Starts a joint seen for the first time or after a loss; no earlier state is kept."""
-    filter_.estimate.mean[j] = 0.0
-    filter_.estimate.mean[j, 0] = z
-    reset(filter_, j)
-    filter_.estimate.cov[j] = 0.0
-    filter_.estimate.cov[j, 0, 0] = R
+    estimate.mean[j] = 0.0
+    estimate.mean[j, 0] = z
+    reset(estimate, j)
+    estimate.cov[j] = 0.0
+    estimate.cov[j, 0, 0] = R
     for k in range(3):
-        filter_.estimate.cov[j, k + 1, k + 1] = rest_std[k] ** 2
+        estimate.cov[j, k + 1, k + 1] = rest_std[k] ** 2
 
 
 @njit(cache=True, inner=True)
-def _rename(filter_: Filter) -> None:
+def _rename(mean: Floats) -> None:
     """Keeps the angles of each arm near the canonical form. The posture is unchanged: alpha_2 is mirrored, P stays."""
     for first in (RIGHT_ARM, LEFT_ARM):
-        arm = filter_.estimate.mean[first : first + 4, 0].copy()
+        arm = mean[first : first + 4, 0].copy()
         if canonical_arm(arm, _NAME_MARGIN):
-            filter_.estimate.mean[first + 1] *= -1.0
-        filter_.estimate.mean[first : first + 4, 0] = arm
+            mean[first + 1] *= -1.0
+        mean[first : first + 4, 0] = arm
 
 
 @njit(cache=True, inner=True)
@@ -188,12 +199,12 @@ def _leave(filter_: Filter, k: int, rules: Rules, track: Track, damping: Floats)
     for j in range(DOF):
         for a in range(4):
             track.motion[a, k, j] = filter_.estimate.mean[j, a]
-        for a in range(2):
-            track.motion[4 + a, k, j] = np.sqrt(variance_factor(filter_, j, a, rules) * filter_.estimate.cov[j, a, a])
+    write_deviations(filter_.estimate, rules, track.motion[4:, k])
     track.lengths[0, k] = filter_.estimate.lengths
     track.lengths[1, k] = np.sqrt(filter_.estimate.lengths_var)
     write_residual(filter_, filter_.estimate.tick_ns[0], rules, track.residual[k])
-    write_unseen_times(filter_, track.unseen[k])
+    now = filter_.estimate.tick_ns[0]
+    write_unseen_times(now, filter_.estimate.row_ns, filter_.model.carried_ns, track.unseen[k])
     track.frame_age[k] = (filter_.estimate.tick_ns[0] - filter_.gate.newest_ns[0]) * 1e-9
     place(filter_, filter_.estimate.mean[:, 0].copy(), track.points[k], track.camera_points[k])
     if len(track.cov) > 0:
@@ -201,7 +212,8 @@ def _leave(filter_: Filter, k: int, rules: Rules, track: Track, damping: Floats)
         track.damping[k] = damping
         track.spread[k] = filter_.estimate.spread
         for j in range(DOF):
-            track.autocorrelation[k, j] = autocorrelation(filter_, j)
+            squares, products = filter_.estimate.squares[j], filter_.estimate.products[j]
+            track.autocorrelation[k, j] = autocorrelation(squares, products)
 
 
 @njit(cache=True, inner=True)

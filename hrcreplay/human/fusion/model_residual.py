@@ -20,7 +20,15 @@ import numpy as np
 
 from hrcreplay.geometry.vectors import distance
 from hrcreplay.human.fusion.body_points import REACH_M, distance_shown, learn, shift
-from hrcreplay.human.fusion.kalman import Filter, Rules, delay, extrapolate_back
+from hrcreplay.human.fusion.kalman import (
+    SHOWN_NS,
+    Filter,
+    ModelResidual,
+    Rules,
+    StateEstimate,
+    delay,
+    extrapolate_back,
+)
 from hrcreplay.human.model import ARM_POINTS, BENDS, HEAD, HEIGHT, LEFT_ARM, PELVIS, RIGHT_ARM, skeleton_row
 from hrcreplay.kernels import njit
 from hrcreplay.records import BODY, POINTS, Bools, Floats, Ints
@@ -67,22 +75,26 @@ def observe(filter_: Filter, fresh: Bools, now: int, rules: Rules, outliers: Int
         plain = np.full(filter_.gate.points[0].shape, np.nan)
         skeleton_row(p, filter_.estimate.lengths, plain)
         model = plain.copy()
-        shift(filter_, p, model)
+        shift(filter_.model.offset, p, model)
         _depart(filter_, c, model, now, rules)
         shown = np.zeros(len(BODY), np.bool_)
         for k in range(len(BODY)):
             has = filter_.gate.valid[c, :2].all() if k == _LEGS else filter_.gate.shows[c, k]
-            shown[k] = has and _settled(filter_, k, now, rules)
+            shown[k] = has and _settled(filter_.estimate, k, now, rules.memory_ns)
         for limb in np.flatnonzero(shown[:_LEGS]):
             sample = 0.0
             for k in _ENDS[limb]:
-                sample = max(sample, distance_shown(filter_, c, k, plain, model, now))
-            _enter(filter_, limb, now, sample, rules)
+                recent = now - filter_.model.carried_ns[c, k] <= SHOWN_NS
+                along = plain[k] + filter_.model.carried[c, k] - model[k] if recent else np.zeros(3)
+                sample = max(sample, distance_shown(filter_.gate.points[c, k], model[k], along))
+            _enter(filter_.model, limb, now, sample, rules)
         if shown[_LEGS]:
-            below = _farthest(filter_, c, _BELOW, model[PELVIS], rules)
+            seen = filter_.gate.confidence[c] >= rules.confidence_min
+            counts = seen & ~filter_.gate.disbelieved[c]
+            below = _farthest(filter_.gate.points[c], counts, _BELOW, model[PELVIS])
             if below >= 0.0:
-                sample = max(below, _farthest(filter_, c, _HIPS, model[PELVIS], rules))
-                _enter(filter_, np.int64(_LEGS), now, sample, rules)  # as above: numba compiles constants anew
+                sample = max(below, _farthest(filter_.gate.points[c], counts, _HIPS, model[PELVIS]))
+                _enter(filter_.model, _LEGS, now, sample, rules)
         outliers[c] += learn(filter_, c, now, shown, p, plain, model, rules)
     for limb in np.flatnonzero(filter_.model.sampled_ns == now):
         if filter_.model.samples[limb] >= LEAST:
@@ -135,13 +147,19 @@ def write_residual(filter_: Filter, now: int, rules: Rules, residual: Floats) ->
 
 
 @njit(cache=True, inner=True)
-def _farthest(filter_: Filter, c: int, points: Ints, pelvis: Floats, rules: Rules) -> float:
-    """Returns the maximum distance of leg points from the line below the pelvis (3,) [m]; -1 if none is seen."""
+def _farthest(points: Floats, counts: Bools, which: Ints, pelvis: Floats) -> float:
+    """Returns the maximum distance of leg points from the line below the pelvis (3,) [m]; -1 if none is seen.
+
+    Args:
+        points: (20, 3) [m].
+        counts: (20,) True for those that a camera shows, and that are believed.
+        which: Indices of the leg points.
+        pelvis: (3,) [m].
+    """
     farthest = -1.0
-    for k in points:
-        point = filter_.gate.points[c, k]
-        near = filter_.gate.confidence[c, k] >= rules.confidence_min and distance(point, pelvis) <= REACH_M
-        if near and not filter_.gate.disbelieved[c, k]:
+    for k in which:
+        point = points[k]
+        if counts[k] and distance(point, pelvis) <= REACH_M:
             beyond = point[2] - max(0.0, min(point[2], pelvis[2]))
             off = np.sqrt((point[0] - pelvis[0]) ** 2 + (point[1] - pelvis[1]) ** 2 + beyond**2)
             farthest = max(farthest, off)
@@ -149,33 +167,38 @@ def _farthest(filter_: Filter, c: int, points: Ints, pelvis: Floats, rules: Rule
 
 
 @njit(cache=True, inner=True)
-def _settled(filter_: Filter, limb: int, now: int, rules: Rules) -> bool:
+def _settled(estimate: StateEstimate, limb: int, now: int, memory_ns: int) -> bool:
     """Returns True if no joint that carries the limb is lost or has restarted recently."""
     root = 2 if limb == _LEGS else 4
-    newest, last = filter_.estimate.acquired_ns[:root].max(), filter_.estimate.row_ns[:root].min()
-    newest, last = max(newest, filter_.estimate.acquired_ns[HEIGHT]), min(last, filter_.estimate.row_ns[HEIGHT])
+    newest, last = estimate.acquired_ns[:root].max(), estimate.row_ns[:root].min()
+    newest, last = max(newest, estimate.acquired_ns[HEIGHT]), min(last, estimate.row_ns[HEIGHT])
     if 2 <= limb < _LEGS:
         first = _FIRST[limb - 2]
-        newest = max(newest, filter_.estimate.acquired_ns[first - first % 4 : first + 2].max())
+        newest = max(newest, estimate.acquired_ns[first - first % 4 : first + 2].max())
         for pair in range(first - first % 4, first + 2, 2):  # one of the two is enough, see ``write_unseen_times``
-            last = min(last, filter_.estimate.row_ns[pair : pair + 2].max())
-    return now - newest > rules.memory_ns and now - last <= rules.memory_ns
+            last = min(last, estimate.row_ns[pair : pair + 2].max())
+    return now - newest > memory_ns and now - last <= memory_ns
 
 
 @njit(cache=True, inner=True)
-def write_unseen_times(filter_: Filter, seconds: Floats) -> None:
-    """Writes the time since the last valid row of each limb's own joints, (7,) [s]; for the legs, knees and ankles.
+def write_unseen_times(now: int, row_ns: Ints, carried_ns: Ints, seconds: Floats) -> None:
+    """Writes the time since the last valid row of each limb's own joints; for the legs, knees and ankles.
 
     Head and thorax count as seen if all four joints of the torso are seen. For the two joints of a part of an arm one
     is enough: the other may be unobservable where it has no effect (alpha_3 with a straight elbow).
+
+    Args:
+        now: The tick [ns].
+        row_ns: (20,) tick at which each row was last valid.
+        carried_ns: (c, 20) capture at which each camera last observed a point.
+        seconds: (7,) receives the times [s].
     """
-    now = filter_.estimate.tick_ns[0]
-    seconds[:2] = _since(now, filter_.estimate.row_ns[:4].min())
+    seconds[:2] = _since(now, row_ns[:4].min())
     for i in range(len(_FIRST)):
-        seconds[2 + i] = _since(now, filter_.estimate.row_ns[_FIRST[i] : _FIRST[i] + 2].max())
+        seconds[2 + i] = _since(now, row_ns[_FIRST[i] : _FIRST[i] + 2].max())
     seen = now
     for k in BENDS:
-        seen = min(seen, filter_.model.carried_ns[:, k].max())
+        seen = min(seen, carried_ns[:, k].max())
     seconds[_LEGS] = _since(now, seen)
 
 
@@ -185,19 +208,19 @@ def _since(now: int, then: int) -> float:
 
 
 @njit(cache=True, inner=True)
-def _enter(filter_: Filter, limb: int, now: int, sample: float, rules: Rules) -> None:
+def _enter(model: ModelResidual, limb: int, now: int, sample: float, rules: Rules) -> None:
     """Reduces the weights of a limb's earlier samples and adds one of weight 1; ignores a sample that is not finite."""
     if not sample >= 0.0:
         return
-    age = min(now - filter_.model.sampled_ns[limb], rules.memory_ns) * 1e-9
+    age = min(now - model.sampled_ns[limb], rules.memory_ns) * 1e-9
     kept = np.exp(-age / rules.residual_memory_s)
-    if sample >= filter_.model.peak[limb] or now - filter_.model.peak_ns[limb] >= rules.residual_hold_ns:
-        filter_.model.peak[limb], filter_.model.peak_ns[limb] = sample, now
-    filter_.model.residuals[limb] *= kept
-    filter_.model.residuals[limb, int(min(sample / _BIN_M, BINS - 1.0))] += 1.0  # inf cannot be converted to an integer
-    filter_.model.weight[limb] = kept * filter_.model.weight[limb] + 1.0
-    filter_.model.samples[limb] += 1
-    filter_.model.sampled_ns[limb] = now
+    if sample >= model.peak[limb] or now - model.peak_ns[limb] >= rules.residual_hold_ns:
+        model.peak[limb], model.peak_ns[limb] = sample, now
+    model.residuals[limb] *= kept
+    model.residuals[limb, int(min(sample / _BIN_M, BINS - 1.0))] += 1.0  # inf cannot be converted to an integer
+    model.weight[limb] = kept * model.weight[limb] + 1.0
+    model.samples[limb] += 1
+    model.sampled_ns[limb] = now
 
 
 @njit(cache=True, inner=True)

@@ -17,8 +17,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from hrcreplay.human.fusion.kalman import Filter, Rules
+from hrcreplay.human.fusion.kalman import Rules, StateEstimate
 from hrcreplay.kernels import njit
+from hrcreplay.records import DOF, Floats
 
 #: Maximum square before the first innovation; the reported variances are then about those of the filter.
 FIRST_SPREAD = 4.0
@@ -43,51 +44,60 @@ FITTED = np.array(
 
 
 @njit(cache=True, inner=True)
-def reset(filter_: Filter, j: int) -> None:
+def reset(estimate: StateEstimate, j: int) -> None:
     """Resets joint j after its acquisition, without an innovation."""
-    filter_.estimate.innovation[:, j], filter_.estimate.squares[j], filter_.estimate.products[j] = 0.0, 0.0, 0.0
-    filter_.estimate.spread[j] = FIRST_SPREAD
+    estimate.innovation[:, j], estimate.squares[j], estimate.products[j] = 0.0, 0.0, 0.0
+    estimate.spread[j] = FIRST_SPREAD
 
 
 @njit(cache=True, inner=True)
-def add_innovation(filter_: Filter, c: int, j: int, innovation: float, now: int, rules: Rules) -> None:
+def add_innovation(estimate: StateEstimate, c: int, j: int, innovation: float, now: int, memory_s: float) -> None:
     """Adds a normalised innovation of joint j; ``row_ns`` is still the tick of the previous one.
 
     Args:
-        filter_: Sums, last innovation and spread of the joint are changed.
+        estimate: Sums, last innovation and spread of the joint are changed.
         c: Index of the camera.
         j: Index into JOINTS.
         innovation: Innovation over its standard deviation.
         now: The tick [ns].
-        rules: Memory of the spread [s].
+        memory_s: Memory of the spread [s].
     """
-    age_s = (now - filter_.estimate.row_ns[j]) * 1e-9
+    age_s = (now - estimate.row_ns[j]) * 1e-9
     kept = np.exp(-age_s / _MEMORY_S)
-    filter_.estimate.squares[j] = kept * filter_.estimate.squares[j] + innovation**2
-    filter_.estimate.products[j] = kept * filter_.estimate.products[j] + innovation * filter_.estimate.innovation[c, j]
-    filter_.estimate.innovation[c, j] = innovation
-    filter_.estimate.spread[j] = max(np.exp(-age_s / rules.spread_memory_s) * filter_.estimate.spread[j], innovation**2)
+    estimate.squares[j] = kept * estimate.squares[j] + innovation**2
+    estimate.products[j] = kept * estimate.products[j] + innovation * estimate.innovation[c, j]
+    estimate.innovation[c, j] = innovation
+    estimate.spread[j] = max(np.exp(-age_s / memory_s) * estimate.spread[j], innovation**2)
 
 
 @njit(cache=True, inner=True)
-def autocorrelation(filter_: Filter, j: int) -> float:
-    """Autocorrelation of joint j's innovations by the same camera, at lag 1, in [-1, 1]; 0 without innovations."""
-    if not 0.0 < filter_.estimate.squares[j] < np.inf:
-        return 0.0
-    return float(max(-1.0, min(filter_.estimate.products[j] / filter_.estimate.squares[j], 1.0)))
-
-
-@njit(cache=True, inner=True)
-def variance_factor(filter_: Filter, j: int, a: int, rules: Rules) -> float:
-    """Factor on the variance of a joint; at least 1 while it coasts, as there are then no innovations.
+def autocorrelation(squares: float, products: float) -> float:
+    """Autocorrelation of a joint's innovations by the same camera, at lag 1, in [-1, 1]; 0 without innovations.
 
     Args:
-        filter_: After the tick.
-        j: Index into JOINTS.
-        a: 0 for the variance of p, 1 for that of v.
-        rules: Bounds on the factor.
+        squares: Running sum of the squares of the innovations.
+        products: Running sum of their products with the one before.
     """
-    least = 1.0 if filter_.estimate.tick_ns[0] - filter_.estimate.row_ns[j] > rules.coast_ns else rules.spread_least
-    offset, slope = FITTED[KIND[j], a]
-    scale = filter_.estimate.spread[j] * np.exp(offset + slope * autocorrelation(filter_, j))
-    return float(max(least, min(scale, rules.spread_most)))
+    if not 0.0 < squares < np.inf:
+        return 0.0
+    return float(max(-1.0, min(products / squares, 1.0)))
+
+
+@njit(cache=True, inner=True)
+def write_deviations(estimate: StateEstimate, rules: Rules, deviations: Floats) -> None:
+    """Writes the reported standard deviations of p and v of each joint, (2, 13) [m or rad, and these per s].
+
+    The factor on a variance is at least 1 while the joint coasts, as there are then no innovations.
+
+    Args:
+        estimate: After the tick.
+        rules: Bounds on the factor.
+        deviations: Receives them.
+    """
+    for j in range(DOF):
+        least = 1.0 if estimate.tick_ns[0] - estimate.row_ns[j] > rules.coast_ns else rules.spread_least
+        correlated = autocorrelation(estimate.squares[j], estimate.products[j])
+        for a in range(2):
+            scale = estimate.spread[j] * np.exp(FITTED[KIND[j], a, 0] + FITTED[KIND[j], a, 1] * correlated)
+            factor = max(least, min(scale, rules.spread_most))
+            deviations[a, j] = np.sqrt(factor * estimate.cov[j, a, a])
