@@ -30,6 +30,7 @@ from hrcreplay.pipeline.progress import NO_PROGRESS
 from hrcreplay.pipeline.run_config import resolve
 from hrcreplay.records import BODY, DOF, POINTS, Floats, HumanStates, Ints, SkeletonTrack
 from hrcreplay.robot.control.minimiser import compile_second_tries
+from hrcreplay.robot.control.separation import no_obstacles
 from hrcreplay.settings.sections import Plan
 from hrcreplay.store.columns import read_states, state_columns
 from hrcreplay.store.run_folder import RunWriter, Stopwatch
@@ -87,16 +88,19 @@ def _compile_rest(states: HumanStates) -> None:
 
 
 def _compile_robot(scratch: Path) -> None:
-    """The prediction by default, and every controller beside a person who comes up to the robot."""
+    """Every controller: first with nobody there, while the other process compiles the prediction."""
     compile_second_tries()
     overrides = ("plan.method=qp", f"plan.baselines={[name for name in _METHODS if name != 'qp']}")
     how: Any = {"cell_file": replay.demo_cell(), "overrides": overrides, **_SPAN}
     run_config = resolve("plan", replay.demo_log(), **how)
     log = open_log(run_config.log, run_config.settings.logs)
     ticks_ns = stages.span_ticks(run_config, log)
-    base_m = assembly.robot_base(run_config, log)[:3, 3]
+    T_world_base = assembly.robot_base(run_config, log)
+    programme = assembly.programme(run_config, log, assembly.robot(run_config, T_world_base))
+    for planner in assembly.planners(run_config, programme, int(ticks_ns[0])).values():
+        planner.controller.step(lambda _horizon_s: no_obstacles())
     with RunWriter(scratch / "robot") as writer:
-        writer.table("state", state_columns(_approaching(ticks_ns, base_m, log.header.cameras)))
+        writer.table("state", state_columns(_approaching(ticks_ns, T_world_base[:3, 3], log.header.cameras)))
         writer.close_tables()
         sink = stages.Sink(writer, Stopwatch(time.perf_counter_ns), NO_PROGRESS.advance)
         how = {"folder": writer.partial, "smooth": False}

@@ -14,7 +14,7 @@ import numpy as np
 
 from hrcreplay.geometry.vectors import distance
 from hrcreplay.human.fusion.disbelief import is_broken
-from hrcreplay.human.fusion.kalman import SHOWN_NS, Filter, Gate, ModelResidual, Rules
+from hrcreplay.human.fusion.kalman import SHOWN_NS, Filter, Gate, ModelResidual, Rules, StateEstimate
 from hrcreplay.human.model import ARM_POINTS, HANDS, HEAD, LEG_POINTS, NECK, PELVIS, skeleton_row, torso_rotation
 from hrcreplay.kernels import njit
 from hrcreplay.records import BODY, LIMBS, POINTS, Bools, Floats, Ints
@@ -222,36 +222,37 @@ def distance_shown(point: Floats, start: Floats, along: Floats) -> float:
 
 
 @njit(cache=True, inner=True)
-def place(filter_: Filter, p: Floats, points: Floats, camera_points: Floats) -> None:
+def place(estimate: StateEstimate, model: ModelResidual, points: Floats, camera_points: Floats) -> None:
     """Writes the points at the tick; NaN for hands and legs that no camera has observed recently.
 
     Args:
-        filter_: After the tick.
-        p: (13,) the posture [m, m, rad..., m].
+        estimate: After the tick.
+        model: The same.
         points: (20, 3) receives the points, world [m].
         camera_points: (c, 20, 3) receives the recent points of each camera, world [m]; while the torso is seen, only
             those further than ``ALIKE_M`` from ``points``, and but for legs that much nearer to them, so that volumes
             do not jump.
     """
-    skeleton_row(p, filter_.estimate.lengths, points)
+    p = estimate.mean[:, 0].copy()
+    skeleton_row(p, estimate.lengths, points)
     base = points.copy()
-    shift(filter_.model.offset, p, points)
+    shift(model.offset, p, points)
     for n, k in enumerate(HANDS):
         base[k] = points[_WRISTS[n]]
     for k in LEG_POINTS:
         base[k, :2], base[k, 2] = points[PELVIS, :2], 0.0
-    now = filter_.estimate.tick_ns[0]
+    now = estimate.tick_ns[0]
     for k in _ATTACHED:
-        c = filter_.model.carried_ns[:, k].argmax()
-        if now - filter_.model.carried_ns[c, k] <= SHOWN_NS:
-            points[k] = base[k] + filter_.model.carried[c, k]
+        c = model.carried_ns[:, k].argmax()
+        if now - model.carried_ns[c, k] <= SHOWN_NS:
+            points[k] = base[k] + model.carried[c, k]
     for side in range(2):
         if np.isnan(points[_FEET[side], 0]):
-            points[_FEET[side]] = points[_ANKLES[side]] + _turned(filter_.model.foot[side], p[2])
-    sees_torso = now - filter_.estimate.row_ns[:4].min() <= SHOWN_NS
-    for c in range(len(camera_points)):
-        recent = now - filter_.model.carried_ns[c] <= SHOWN_NS
-        _place_shown(recent, filter_.model.carried[c], base, points, sees_torso, camera_points[c])
+            points[_FEET[side]] = points[_ANKLES[side]] + _turned(model.foot[side], p[2])
+    sees_torso = now - estimate.row_ns[:4].min() <= SHOWN_NS
+    for camera in range(len(camera_points)):
+        recent = now - model.carried_ns[camera] <= SHOWN_NS
+        _place_shown(recent, model.carried[camera], base, points, sees_torso, camera_points[camera])
 
 
 @njit(cache=True, inner=True)

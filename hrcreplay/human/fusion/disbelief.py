@@ -19,7 +19,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from hrcreplay.geometry.vectors import distance
-from hrcreplay.human.fusion.kalman import SHOWN_NS, Filter, Rules
+from hrcreplay.human.fusion.kalman import SHOWN_NS, Gate, ModelResidual, Rules
 from hrcreplay.human.model import LEG_POINTS
 from hrcreplay.kernels import njit
 from hrcreplay.records import FLOOR_Z_M, POINTS, Bools, Floats, Ints
@@ -41,17 +41,17 @@ _BONES_KNOWN = 20
 
 
 @njit(cache=True, inner=True)
-def judge(filter_: Filter, c: int, now: int, whole: Bools, rules: Rules) -> None:
+def judge(gate: Gate, model: ModelResidual, c: int, now: int, whole: Bools, rules: Rules) -> None:
     """Updates the evidence by a camera's new frame, and which of its points are believed.
 
     Args:
-        filter_: Contains the frame; ``wrong``, ``judged_ns`` and ``disbelieved`` of the camera are changed.
+        gate: Contains the frame; ``wrong``, ``judged_ns`` and ``disbelieved`` of the camera are changed.
+        model: Contains the lengths of the legs' bones.
         c: Index of the camera.
         now: The tick [ns].
         whole: (20,) False for points at the end of a bone unlike the person's.
         rules: Settings of the filter.
     """
-    gate, model = filter_.gate, filter_.model
     shown = _find_shown(gate.points, gate.confidence, gate.uses, rules.confidence_min)
     at_once, believed = shown.copy(), shown & (gate.wrong <= _MOST)
     for a in range(len(shown)):

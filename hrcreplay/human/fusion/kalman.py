@@ -154,18 +154,17 @@ class Track(NamedTuple):
 
 
 @njit(cache=True, inner=True)
-def delay(filter_: Filter, c: int, now: int, rules: Rules) -> float:
-    """Age of the stored frame of a camera [s]; 0 if delays are ignored.
+def delay(capture_ns: int, now: int, rules: Rules) -> float:
+    """Age of a frame [s]; 0 if delays are ignored.
 
     Args:
-        filter_: Contains the frame.
-        c: Index of the camera.
+        capture_ns: Its capture [ns].
         now: The tick [ns].
         rules: Compensation of delays, and the maximum delay [s].
     """
     if not rules.compensate:
         return 0.0
-    return max(0.0, min((now - filter_.gate.capture_ns[c]) * 1e-9, rules.delay_max_s))
+    return max(0.0, min((now - capture_ns) * 1e-9, rules.delay_max_s))
 
 
 @njit(cache=True, inner=True)

@@ -58,7 +58,7 @@ def run(ticks_ns: Ints, frames: Frames, filter_: Filter, rules: Rules, track: Tr
         fresh = filter_.gate.uses == 0
         for c in range(len(fresh)):
             if fresh[c]:
-                validate_frame(filter_, c, now, rules, track)
+                validate_frame(filter_, c, now, rules, track.outliers, track.disbelieved[c])
         if filter_.estimate.started[0]:
             observe(filter_, fresh, now, rules, track.outliers)
         for c in range(len(fresh)):
@@ -117,10 +117,10 @@ def _update(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> bo
     if not filter_.gate.valid[c].any():
         return False
     if not filter_.estimate.started[0]:
-        _start(filter_, c)
-    d = delay(filter_, c, now, rules)
+        _start(filter_.estimate, filter_.gate.points[c])
+    d = delay(filter_.gate.capture_ns[c], now, rules)
     h = np.array([1.0, -d, d**2 / 2.0, -(d**3) / 6.0])
-    z = _named(filter_, c, h)
+    z = _named(filter_.estimate, filter_.gate, c, h)
     for row in range(ROWS):
         if not filter_.gate.valid[c, row]:
             continue
@@ -146,17 +146,17 @@ def _update(filter_: Filter, c: int, now: int, rules: Rules, track: Track) -> bo
 
 
 @njit(cache=True, inner=True)
-def _named(filter_: Filter, c: int, h: Floats) -> Floats:
+def _named(estimate: StateEstimate, gate: Gate, c: int, h: Floats) -> Floats:
     """Returns the rows (20,) of a camera's frame, arms in the form and heading in the turn nearest to the estimate."""
-    z = filter_.gate.z[c].copy()
+    z = gate.z[c].copy()
     expected, variance = np.empty(DOF), np.empty(DOF)
     for j in range(DOF):
-        if not filter_.gate.valid[c, j]:
+        if not gate.valid[c, j]:
             z[j] = np.nan
-        expected[j] = dot(h, filter_.estimate.mean[j])
-        variance[j] = filter_.gate.z_var[c, j]
+        expected[j] = dot(h, estimate.mean[j])
+        variance[j] = gate.z_var[c, j]
         for a in range(4):
-            variance[j] += h[a] * dot(filter_.estimate.cov[j, a], h)
+            variance[j] += h[a] * dot(estimate.cov[j, a], h)
     z[2] = expected[2] + wrap(z[2] - expected[2])
     for first in (RIGHT_ARM, LEFT_ARM):
         arm = slice(first, first + 4)
@@ -165,11 +165,11 @@ def _named(filter_: Filter, c: int, h: Floats) -> Floats:
 
 
 @njit(cache=True, inner=True)
-def _start(filter_: Filter, c: int) -> None:
-    """Starts the person, with the base under the seen points until the pelvis is seen."""
-    filter_.estimate.started[0] = True
+def _start(estimate: StateEstimate, points: Floats) -> None:
+    """Starts the person, with the base under the seen ones of the points (20, 3) until the pelvis is seen."""
+    estimate.started[0] = True
     for axis in range(2):
-        filter_.estimate.mean[axis, 0] = np.nanmean(filter_.gate.points[c, :, axis])
+        estimate.mean[axis, 0] = np.nanmean(points[:, axis])
 
 
 @njit(cache=True, inner=True)
@@ -196,17 +196,17 @@ def _rename(mean: Floats) -> None:
 
 @njit(cache=True, inner=True)
 def _leave(filter_: Filter, k: int, rules: Rules, track: Track, damping: Floats) -> None:
+    now = filter_.estimate.tick_ns[0]
     for j in range(DOF):
         for a in range(4):
             track.motion[a, k, j] = filter_.estimate.mean[j, a]
     write_deviations(filter_.estimate, rules, track.motion[4:, k])
     track.lengths[0, k] = filter_.estimate.lengths
     track.lengths[1, k] = np.sqrt(filter_.estimate.lengths_var)
-    write_residual(filter_, filter_.estimate.tick_ns[0], rules, track.residual[k])
-    now = filter_.estimate.tick_ns[0]
+    write_residual(filter_.model, filter_.gate, now, rules, track.residual[k])
     write_unseen_times(now, filter_.estimate.row_ns, filter_.model.carried_ns, track.unseen[k])
-    track.frame_age[k] = (filter_.estimate.tick_ns[0] - filter_.gate.newest_ns[0]) * 1e-9
-    place(filter_, filter_.estimate.mean[:, 0].copy(), track.points[k], track.camera_points[k])
+    track.frame_age[k] = (now - filter_.gate.newest_ns[0]) * 1e-9
+    place(filter_.estimate, filter_.model, track.points[k], track.camera_points[k])
     if len(track.cov) > 0:
         track.cov[k] = filter_.estimate.cov
         track.damping[k] = damping

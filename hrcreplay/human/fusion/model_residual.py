@@ -23,6 +23,7 @@ from hrcreplay.human.fusion.body_points import REACH_M, distance_shown, learn, s
 from hrcreplay.human.fusion.kalman import (
     SHOWN_NS,
     Filter,
+    Gate,
     ModelResidual,
     Rules,
     StateEstimate,
@@ -71,12 +72,12 @@ def observe(filter_: Filter, fresh: Bools, now: int, rules: Rules, outliers: Int
         outliers: (c,) number of a camera's points that disagree with the person; those of broken legs are added.
     """
     for c in np.flatnonzero(fresh):
-        p = extrapolate_back(filter_.estimate.mean, delay(filter_, c, now, rules))
+        p = extrapolate_back(filter_.estimate.mean, delay(filter_.gate.capture_ns[c], now, rules))
         plain = np.full(filter_.gate.points[0].shape, np.nan)
         skeleton_row(p, filter_.estimate.lengths, plain)
         model = plain.copy()
         shift(filter_.model.offset, p, model)
-        _depart(filter_, c, model, now, rules)
+        _depart(filter_.gate, c, model, now, rules.outlier_m)
         shown = np.zeros(len(BODY), np.bool_)
         for k in range(len(BODY)):
             has = filter_.gate.valid[c, :2].all() if k == _LEGS else filter_.gate.shows[c, k]
@@ -103,47 +104,48 @@ def observe(filter_: Filter, fresh: Bools, now: int, rules: Rules, outliers: Int
 
 
 @njit(cache=True, inner=True)
-def _depart(filter_: Filter, c: int, model: Floats, now: int, rules: Rules) -> None:
+def _depart(gate: Gate, c: int, model: Floats, now: int, outlier_m: float) -> None:
     """Writes the distance of each limb's rejected points in a camera's frame from the model (20, 3) [m].
 
     A point counts if this or another camera has shown it there before, and no camera shows it near the model.
     """
-    filter_.gate.apart[c] = 0.0
+    gate.apart[c] = 0.0
     for limb in range(len(_ENDS)):
         for k in _ENDS[limb]:
-            since = filter_.gate.refused_ns[c, k]
-            if since <= filter_.gate.point_ns[k]:
+            since = gate.refused_ns[c, k]
+            if since <= gate.point_ns[k]:
                 continue
-            here, shown = filter_.gate.refused_at[c, k], since < now
-            for other in range(len(filter_.gate.apart)):
-                both = other != c and filter_.gate.refused_ns[other, k] > filter_.gate.point_ns[k]
-                shown = shown or (both and distance(filter_.gate.refused_at[other, k], here) <= rules.outlier_m)
+            here, shown = gate.refused_at[c, k], since < now
+            for other in range(len(gate.apart)):
+                both = other != c and gate.refused_ns[other, k] > gate.point_ns[k]
+                shown = shown or (both and distance(gate.refused_at[other, k], here) <= outlier_m)
             if shown:
-                filter_.gate.apart[c, limb] = max(filter_.gate.apart[c, limb], distance(here, model[k]))
+                gate.apart[c, limb] = max(gate.apart[c, limb], distance(here, model[k]))
 
 
 @njit(cache=True, inner=True)
-def write_residual(filter_: Filter, now: int, rules: Rules, residual: Floats) -> None:
+def write_residual(model: ModelResidual, gate: Gate, now: int, rules: Rules, residual: Floats) -> None:
     """Writes the residual of each limb of BODY used at a tick, (7,) [m]; NaN until known.
 
     It includes points that the gates still reject, so that volumes contain both the filter's estimate and the camera's
     points.
 
     Args:
-        filter_: After ``observe``.
+        model: After ``observe``.
+        gate: The same.
         now: The tick [ns].
         rules: Settings of the filter.
         residual: Receives the quantiles, or larger distances of rejected points.
     """
-    residual[:] = filter_.model.residual
+    residual[:] = model.residual
     for limb in range(len(residual)):
-        if now - filter_.model.peak_ns[limb] < rules.residual_hold_ns and residual[limb] < filter_.model.peak[limb]:
-            residual[limb] = filter_.model.peak[limb]
-    for c in range(len(filter_.gate.apart)):
-        if now - filter_.gate.capture_ns[c] <= rules.memory_ns:
-            for limb in range(filter_.gate.apart.shape[1]):
-                if filter_.gate.apart[c, limb] > 0.0:
-                    residual[limb] = np.fmax(residual[limb], filter_.gate.apart[c, limb])
+        if now - model.peak_ns[limb] < rules.residual_hold_ns and residual[limb] < model.peak[limb]:
+            residual[limb] = model.peak[limb]
+    for c in range(len(gate.apart)):
+        if now - gate.capture_ns[c] <= rules.memory_ns:
+            for limb in range(gate.apart.shape[1]):
+                if gate.apart[c, limb] > 0.0:
+                    residual[limb] = np.fmax(residual[limb], gate.apart[c, limb])
 
 
 @njit(cache=True, inner=True)
