@@ -111,6 +111,8 @@ def run(
         failed = _run_all(results, todo, scheduler, workers) if todo else {}
         rows = [_row(results, task, number % len(settings), failed.get(task.name)) for number, task in enumerate(tasks)]
         sweep_report.write(results, rows, [setting.values for setting in settings])
+        if costs := sweep_report.cost_text(rows):
+            print_note(f"sweep: {costs}")
     return SweepResult(results.where, failed)
 
 

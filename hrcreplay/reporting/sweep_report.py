@@ -85,6 +85,24 @@ def write(results: ResultsFolder, rows: Sequence[SweepRow], settings: Sequence[V
     results.write("sweep.html", render(rows, settings, totals, front, svg.decode()))
 
 
+def cost_text(rows: Sequence[SweepRow]) -> str:
+    """Says what the runs cost per hour of log, to plan more of them; empty without a run.
+
+    The fusion that settings share is not part of it.
+
+    Args:
+        rows: All runs.
+    """
+    costs = [row.cost for row in rows if row.cost]
+    if not costs:
+        return ""
+    log_s, worker_s, stored = (sum(cost[key] for cost in costs) for key in ("log_seconds", "seconds", "bytes"))
+    return (
+        f"an hour of log with one setting costs {worker_s / log_s:.2f} hours of a worker and "
+        f"{stored / log_s * 3600 / 1e9:.2f} GB of results; a worker needs {max(c['peak_mb'] for c in costs):.0f} MB"
+    )
+
+
 def figures(
     variant: comparison.Variant,
     motion: pd.DataFrame,

@@ -109,6 +109,18 @@ def test_a_setting_that_lacks_the_hardest_log_is_not_on_the_front() -> None:
         assert "touched somebody" not in page
 
 
+def test_costs_are_told_per_hour_of_log() -> None:
+    costs = [
+        {"seconds": 30.0, "log_seconds": 60.0, "peak_mb": 600.0, "bytes": 5e6},
+        {"seconds": 60.0, "log_seconds": 120.0, "peak_mb": 800.4, "bytes": 15e6},
+        None,
+    ]
+    rows = [SweepRow("log", n, f"log/{n}", None, cost, "") for n, cost in enumerate(costs)]
+    told = "an hour of log with one setting costs 0.50 hours of a worker and 0.40 GB of results"
+    assert sweep_report.cost_text(rows) == f"{told}; a worker needs 800 MB"
+    assert sweep_report.cost_text(rows[2:]) == ""
+
+
 @pytest.fixture(scope="module")
 def single(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, str]]:
     """Digests of single runs, by method."""
