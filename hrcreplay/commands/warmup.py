@@ -88,7 +88,10 @@ def _compile_rest(states: HumanStates) -> None:
 
 
 def _compile_robot(scratch: Path) -> None:
-    """Every controller: first with nobody there, while the other process compiles the prediction."""
+    """Every controller, beside a person who comes up to the robot.
+
+    Before that each of them moves with nobody there, so that the other process has compiled the prediction by then.
+    """
     compile_second_tries()
     overrides = ("plan.method=qp", f"plan.baselines={[name for name in _METHODS if name != 'qp']}")
     how: Any = {"cell_file": replay.demo_cell(), "overrides": overrides, **_SPAN}

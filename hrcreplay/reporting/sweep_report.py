@@ -88,8 +88,6 @@ def write(results: ResultsFolder, rows: Sequence[SweepRow], settings: Sequence[V
 def cost_text(rows: Sequence[SweepRow]) -> str:
     """Says what the runs cost per hour of log, to plan more of them; empty without a run.
 
-    The fusion that settings share is not part of it.
-
     Args:
         rows: All runs.
     """
@@ -97,9 +95,10 @@ def cost_text(rows: Sequence[SweepRow]) -> str:
     if not costs:
         return ""
     log_s, worker_s, stored = (sum(cost[key] for cost in costs) for key in ("log_seconds", "seconds", "bytes"))
+    most_mb = max(cost["peak_mb"] for cost in costs)
     return (
-        f"an hour of log with one setting costs {worker_s / log_s:.2f} hours of a worker and "
-        f"{stored / log_s * 3600 / 1e9:.2f} GB of results; a worker needs {max(c['peak_mb'] for c in costs):.0f} MB"
+        f"beside the fusion that settings share, an hour of log with one setting costs {worker_s / log_s:.2f} hours of "
+        f"a worker and {stored / log_s * 3600 / 1e9:.2f} GB of results; a worker needs at most {most_mb:.0f} MB"
     )
 
 

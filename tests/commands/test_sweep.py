@@ -117,7 +117,8 @@ def test_costs_are_told_per_hour_of_log() -> None:
     ]
     rows = [SweepRow("log", n, f"log/{n}", None, cost, "") for n, cost in enumerate(costs)]
     told = "an hour of log with one setting costs 0.50 hours of a worker and 0.40 GB of results"
-    assert sweep_report.cost_text(rows) == f"{told}; a worker needs 800 MB"
+    told = f"beside the fusion that settings share, {told}"
+    assert sweep_report.cost_text(rows) == f"{told}; a worker needs at most 800 MB"
     assert sweep_report.cost_text(rows[2:]) == ""
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from hrcreplay.geometry.vectors import distance
 from hrcreplay.human.fusion.disbelief import is_broken
-from hrcreplay.human.fusion.kalman import SHOWN_NS, Filter, Gate, ModelResidual, Rules, StateEstimate
+from hrcreplay.human.fusion.kalman import SHOWN_NS, Filter, ModelResidual, Rules, StateEstimate
 from hrcreplay.human.model import ARM_POINTS, HANDS, HEAD, LEG_POINTS, NECK, PELVIS, skeleton_row, torso_rotation
 from hrcreplay.kernels import njit
 from hrcreplay.records import BODY, LIMBS, POINTS, Bools, Floats, Ints
@@ -45,6 +45,15 @@ _ATTACHED = np.concatenate([HANDS, LEG_POINTS])
 _SHOWABLE = np.concatenate([_MODELLED, np.array([NECK]), _ATTACHED])
 #: Right, left.
 _ANKLES, _FEET = (np.array([POINTS.index(f"{part}_{side}") for side in "rl"]) for part in ("ankle", "foot"))
+
+
+class Carried(NamedTuple):
+    """Body points as a camera observed them last, from what they are carried with, and whether its frame is newer."""
+
+    places: Floats  #: (20, 3) [m]
+    seen_ns: Ints  #: (20,) capture of that observation
+    disbelieved: Bools  #: (20,) True for points that the frame shows wrong
+    capture_ns: int  #: of the frame
 
 
 @njit(cache=True, inner=True)
@@ -87,29 +96,16 @@ def learn(
                 beside += R[i, j] * (filter_.gate.points[c, k, i] - model[k, i])
             filter_.model.offset[k, j] += (beside - filter_.model.offset[k, j]) / weight
         filter_.model.offset_weight[k], filter_.model.offset_ns[k] = weight, now
-    gate, carried = filter_.gate, _carried(filter_.gate, filter_.model, c)
+    gate, residual = filter_.gate, filter_.model
+    carried = Carried(residual.carried[c], residual.carried_ns[c], gate.disbelieved[c], gate.capture_ns[c])
     points, seen = gate.points[c], gate.confidence[c] >= rules.confidence_min
     _carry_body(carried, gate.trusted[c], points, model)
     for n, k in enumerate(HANDS):
         if gate.shows[c, _LOWER_ARMS[n]] and seen[k] and distance(points[k], points[_WRISTS[n]]) <= _HAND_M:
             _carry(carried, k, points[k] - shifted[_WRISTS[n]])
     if filter_.gate.valid[c, :2].all():
-        return _learn_legs(filter_.model, c, now, carried, points, seen, model[PELVIS], p[2])
+        return _learn_legs(residual, c, now, carried, points, seen, model[PELVIS], p[2])
     return 0
-
-
-class Carried(NamedTuple):
-    """Body points as a camera observed them last, from what they are carried with, and whether its frame is newer."""
-
-    places: Floats  #: (20, 3) [m]
-    seen_ns: Ints  #: (20,) capture of that observation
-    disbelieved: Bools  #: (20,) True for points that the frame shows wrong
-    capture_ns: int  #: of the frame
-
-
-@njit(cache=True, inner=True)
-def _carried(gate: Gate, model: ModelResidual, c: int) -> Carried:
-    return Carried(model.carried[c], model.carried_ns[c], gate.disbelieved[c], gate.capture_ns[c])
 
 
 @njit(cache=True, inner=True)
