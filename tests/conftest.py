@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import math
 import os
 import signal
 from pathlib import Path
@@ -57,7 +58,14 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure() -> None:
-    """Lets sessions that tests start hear Ctrl-C: a shell that runs pytest in the background ignores it for all."""
+    """Makes the tests alike on slow machines and in the background.
+
+    Lines of progress, one for every 10 s of a command, would come between the lines that tests read. Sessions that
+    tests start must hear Ctrl-C: a shell that runs pytest in the background ignores it for all.
+    """
+    from hrcreplay.pipeline import progress
+
+    progress.EVERY_S = math.inf
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 

@@ -54,17 +54,17 @@ class ProgressBar:
     A thread of its own shows it, so a part that takes long is not silent.
     """
 
-    def __init__(self, part: str, total: int = 0, *, every_s: float = EVERY_S) -> None:
+    def __init__(self, part: str, total: int = 0, *, every_s: float | None = None) -> None:
         """Prepares the bar.
 
         Args:
             part: First part of the work.
             total: Its number of pieces, as ``advance`` counts them; 0: unknown.
-            every_s: Time between two lines where no terminal shows a bar [s].
+            every_s: Time between two lines where no terminal shows a bar [s]; None: ``EVERY_S``.
         """
         console = Console(stderr=True)
         columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-        self._lines, self._every_s = not console.is_terminal, every_s
+        self._lines, self._every_s = not console.is_terminal, EVERY_S if every_s is None else every_s
         self._bar = RichProgress(
             *columns, TimeRemainingColumn(), console=console, disable=self._lines, transient=True, refresh_per_second=4
         )
