@@ -34,12 +34,12 @@ from hrcreplay.logs.reader import open_log as read_log
 from hrcreplay.logs.writer import LogWriter
 from hrcreplay.pipeline import assembly, reuse, stages
 from hrcreplay.pipeline.person_fuser import PersonFuser
+from hrcreplay.pipeline.planner import Planner
 from hrcreplay.pipeline.run_config import RunConfig, resolve
 from hrcreplay.pipeline.stages import Sink, Told, collect_fusion_findings, collect_plan_findings
 from hrcreplay.pipeline.stored_volumes import StoredVolumes, store_every, store_volumes
 from hrcreplay.pipeline.surroundings import Forecast, Surroundings
 from hrcreplay.records import CameraFrames, Floats, HumanStates, Ints, Motion, SweptVolumes
-from hrcreplay.robot.control.controllers import Planner
 from hrcreplay.robot.task import parse_task
 from hrcreplay.settings.load import load_settings
 from hrcreplay.settings.sections import Robot as RobotSettings

@@ -27,7 +27,7 @@ if "NUMBA_OPT" not in os.environ:  # compiles a fifth faster than level 3; only 
     numba.config.OPT = type(numba.config.OPT)(1)
 
 #: The packages that contain kernels.
-ROOMS = ("audit", "calibration", "geometry", "human", "robot")
+ROOMS = ("audit", "calibration", "geometry", "human", "pipeline/batch", "robot")
 
 
 class KernelCache(FunctionCache):

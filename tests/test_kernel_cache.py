@@ -34,7 +34,7 @@ def test_a_changed_source_gets_a_cache_of_its_own(tmp_path: Path) -> None:
     before = _cache(package)
     assert Path(before).is_relative_to(tmp_path)
     assert _cache(package) == before
-    for name in ("geometry/vectors.py", "human/fusion/kalman.py", "robot/model.py", "audit/measures.py"):
+    for name in ("geometry/vectors.py", "human/fusion/kalman.py", "robot/model.py", "pipeline/batch/ticks.py"):
         source = package / name
         source.write_text(source.read_text() + "\n# changed\n")
         after = _cache(package)
@@ -46,7 +46,8 @@ def test_every_module_with_kernels_is_in_a_room_that_counts() -> None:
     package = Path(hrcreplay.__file__).parent
     with_kernels = [path for path in package.rglob("*.py") if "import njit" in path.read_text()]
     assert with_kernels
-    assert {path.relative_to(package).parts[0] for path in with_kernels} <= set(kernels.ROOMS)
+    rooms = [package / room for room in kernels.ROOMS]
+    assert [path for path in with_kernels if not any(path.is_relative_to(room) for room in rooms)] == []
 
 
 def test_the_users_own_choice_stands(tmp_path: Path) -> None:

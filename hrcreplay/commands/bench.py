@@ -192,7 +192,7 @@ def _time_decisions(run_config: RunConfig, states: HumanStates, progress: Progre
     took, volumes = np.empty(len(t_ns)), np.zeros(len(t_ns))
     for begin in range(0, len(t_ns), BATCH):
         end = min(begin + BATCH, len(t_ns))
-        forecast = Forecast(around, states.rows(slice(int(first[begin]), int(first[end]))), ahead=0)
+        forecast = Forecast(around, states.rows(slice(int(first[begin]), int(first[end]))), most_ahead=0)
 
         def look(tick: int, horizon_s: float, begin: int = begin, forecast: Forecast = forecast) -> Obstacles:
             start_ns = clock()

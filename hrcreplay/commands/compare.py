@@ -36,6 +36,7 @@ from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.pipeline import assembly, reuse, stages
 from hrcreplay.pipeline.assembly import Follower, Recorded
 from hrcreplay.pipeline.kernel_build import ensure_compiled
+from hrcreplay.pipeline.planner import Planner
 from hrcreplay.pipeline.progress import ProgressBar, print_note
 from hrcreplay.pipeline.robot_mass import robot_mass
 from hrcreplay.pipeline.run_config import RunConfig, RunOptions, resolve
@@ -46,7 +47,6 @@ from hrcreplay.records import RECORDED, UNGUARDED, Floats, Ints
 from hrcreplay.reporting import comparison
 from hrcreplay.reporting.comparison import Variant
 from hrcreplay.reporting.summary_text import defect_notes
-from hrcreplay.robot.control.controllers import Planner
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.recorded import RecordedCapsules
 from hrcreplay.robot.task import Reference

@@ -49,21 +49,21 @@ def compile_part(part: str) -> None:
 
 
 def _compile_person(scratch: Path) -> None:
-    """Fusion and smoothing, the printed predictions, and robots on their path beside the recorded person."""
+    """Fusion and smoothing, the printed predictions, and a robot on its path beside the recorded person."""
     from hrcreplay.evaluation.contact import write_contact
 
     how: Any = {"cell_file": replay.demo_cell(), **_SPAN}
     fused = replay.run("fuse", replay.demo_log(), out=scratch / "fuse", smooth=True, **how)
     for method in swept_volumes.PRINTED:
         replay.run("predict", fused, out=scratch / method, overrides=(f"prediction.method={method}",))
-    on_path = [name for name in _METHODS if name not in ("qp", "none")]
-    run_config = resolve("plan", fused, overrides=("plan.method=none", f"plan.baselines={on_path}"))
-    moved = replay.execute(run_config, scratch / "none")
+    run_config = resolve("plan", fused, overrides=("plan.method=ssm", "plan.baselines=[]"))  # in Python
+    moved = replay.execute(run_config, scratch / "ssm")
     states = next(read_states(fused / "state.parquet", 50))
     for method in swept_volumes.METHODS:
         assembly.prediction_stage(run_config).by(method).reachable(states)
     log = open_log(run_config.log, run_config.settings.logs)
     _compile_rest(states)
+    compile_second_tries()
     with RunWriter(scratch / "contact") as writer:
         for path in moved.glob("*.parquet"):
             writer.copy(path.name, moved)
@@ -92,7 +92,6 @@ def _compile_robot(scratch: Path) -> None:
 
     Before that each of them moves with nobody there, so that the other process has compiled the prediction by then.
     """
-    compile_second_tries()
     overrides = ("plan.method=qp", f"plan.baselines={[name for name in _METHODS if name != 'qp']}")
     how: Any = {"cell_file": replay.demo_cell(), "overrides": overrides, **_SPAN}
     run_config = resolve("plan", replay.demo_log(), **how)

@@ -22,6 +22,7 @@ from hrcreplay.logs.capsule_track import CapsuleTrack
 from hrcreplay.logs.joints import JointTrack
 from hrcreplay.logs.log_files import Header
 from hrcreplay.pipeline.fusion_stage import FusionStage
+from hrcreplay.pipeline.planner import Planner
 from hrcreplay.pipeline.robot_mass import contact_speeds
 from hrcreplay.pipeline.run_config import RunConfig, UrdfFiles, link_capsules
 from hrcreplay.pipeline.surroundings import PredictionStage, Surroundings, WatchedBorder
@@ -34,7 +35,7 @@ from hrcreplay.records import (
 )
 from hrcreplay.robot.control.border import Border
 from hrcreplay.robot.control.control_step import PlanSettings
-from hrcreplay.robot.control.controllers import CONTROLLERS, Controller, Planner
+from hrcreplay.robot.control.controllers import CONTROLLERS, Controller
 from hrcreplay.robot.control.programme_check import check_programme
 from hrcreplay.robot.control.recorded import RecordedCapsuleMotion, RecordedMotion
 from hrcreplay.robot.control.static_obstacles import StaticHull, StaticObstacles, half_space

@@ -11,6 +11,7 @@ import numpy as np
 from hrcreplay.human.fusion.vacancy import WatchedArea
 from hrcreplay.human.model import LimitSet
 from hrcreplay.human.prediction import swept_volumes
+from hrcreplay.pipeline.batch.ticks import KNOWN, LEFT, TOO_OLD, PeopleAhead
 from hrcreplay.records import BORDER, Floats, HumanStates, SweptVolumes, volume_name
 from hrcreplay.robot.control.border import Border
 from hrcreplay.robot.control.controllers import Predict
@@ -145,7 +146,7 @@ class Forecast:
 
     around: Surroundings
     states: HumanStates
-    ahead: int = 32  #: largest number of ticks after one whose volumes are computed with it
+    most_ahead: int = 32  #: largest number of ticks after one whose volumes are computed with it
 
     def __post_init__(self) -> None:
         self.t_ns, self._first = self.states.ticks()
@@ -156,6 +157,29 @@ class Forecast:
     def person(self) -> swept_volumes.PreparedPerson:
         """The people, prepared for volumes at any horizon."""
         return self.around.prediction.predictor.prepare(self.states)
+
+    @cached_property
+    def ahead(self) -> PeopleAhead | None:
+        """The people as numbers for the kernel of whole batches; None if it cannot predict them.
+
+        It predicts by ``sound`` alone, without a watched area. Ticks with people who count by their points, or whose
+        torso is out of sight, are left to Python.
+        """
+        person, states = self.person, self.states
+        if person.rows is None or self.around.watched is not None:
+            return None
+        first = self._first[:-1]
+        by_hand = np.logical_or.reduceat(person.by_points | person.partly_seen, first)
+        too_old = np.logical_or.reduceat(~(states.frame_age_s <= self.around.fresh_s), first)
+        return PeopleAhead(
+            person.rows,
+            self._first,
+            np.array(states.numbers),  # a copy, which is not protected
+            np.where(by_hand, LEFT, np.where(too_old, TOO_OLD, KNOWN)),
+            person.predictor.rules,
+            person.predictor.work,
+            person.predictor.prediction.latency_s,
+        )
 
     @cached_property
     def full(self) -> SweptVolumes:
@@ -183,7 +207,7 @@ class Forecast:
         self._last = tick, horizon_s
         first, found = self._ahead.get(horizon_s, (0, None))
         if found is None or not first <= rows.start <= rows.stop <= first + len(found):
-            last = min(tick + min(self._lasted, self.ahead), len(self.t_ns) - 1)
+            last = min(tick + min(self._lasted, self.most_ahead), len(self.t_ns) - 1)
             first, found = rows.start, self.person.volumes(horizon_s, rows.start, self.rows(last).stop)
             self._ahead[horizon_s] = first, found
         return first, found

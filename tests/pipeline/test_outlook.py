@@ -15,8 +15,7 @@ from hrcreplay.logs.reader import open_log
 from hrcreplay.pipeline import assembly, stages
 from hrcreplay.pipeline.run_config import RunConfig, resolve
 from hrcreplay.pipeline.surroundings import Forecast, Surroundings
-from hrcreplay.records import POINTS, HumanStates, Motion
-from hrcreplay.robot.control.control_step import REASONS, motion_row
+from hrcreplay.records import POINTS, HumanStates
 from hrcreplay.robot.control.separation import Obstacles
 from hrcreplay.store.run_folder import Stopwatch
 from tests.pipeline.test_several_people import STAGE, crowd
@@ -48,24 +47,6 @@ def assert_same(found: Obstacles, expected: Obstacles) -> None:
         np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), name)
     assert (found.known, found.horizon_s, found.first) == (expected.known, expected.horizon_s, expected.first)
     np.testing.assert_array_equal(found.numbers, expected.numbers)
-
-
-def test_the_robot_without_reaction_moves_the_same_in_a_batch_and_tick_by_tick() -> None:
-    run_config, states = demo("none")
-    log = open_log(run_config.log, run_config.settings.logs)
-    robot = assembly.robot(run_config, assembly.robot_base(run_config, log))
-    programme = assembly.programme(run_config, log, robot)
-    around, names = assembly.surroundings(run_config, robot), ("limb",) * 20
-    one, other = (assembly.planners(run_config, programme, int(states.t_ns[0]))["none"] for _ in range(2))
-    batch = one.follow(states.t_ns, Forecast(around, states), names)
-    alone = Forecast(around, states)
-    steps = [other.controller.step(alone.predict(tick)) for tick in range(len(states))]
-    rows = [motion_row(s.state, s.step, s.point.T_world_tcp[:3, 3], s.point.tcp_speed, s.programme_s) for s in steps]
-    expected = Motion.of_rows(states.t_ns, rows, limbs=names, links=batch.links, reasons=REASONS)
-    for name, value in vars(expected).items():
-        np.testing.assert_array_equal(getattr(batch, name), value, name)
-    assert np.isfinite(batch.distance_m).mean() > 0.9
-    assert len(set(batch.horizon_s.tolist())) > 10
 
 
 @pytest.mark.parametrize("method", ["sound", "paper", "positions"])
@@ -104,5 +85,5 @@ def test_volumes_computed_ahead_are_those_asked_for() -> None:
     for _ in range(2):  # two methods ask for the same
         for tick, horizon_s in enumerate(asked):
             assert_same(
-                forecast.obstacles(tick, horizon_s), Forecast(around, states, ahead=0).obstacles(tick, horizon_s)
+                forecast.obstacles(tick, horizon_s), Forecast(around, states, most_ahead=0).obstacles(tick, horizon_s)
             )

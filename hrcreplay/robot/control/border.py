@@ -73,7 +73,5 @@ class Border:
 
 
 def _obstacles(vertices: Floats, offsets: Ints, radius: Floats, horizon_s: float, first: int) -> Obstacles:
-    for array in (vertices, radius):  # like those of a person; otherwise numba compiles all kernels again
-        array.setflags(write=False)
     around, known = boxes(vertices, offsets, radius)
     return Obstacles(vertices, offsets, radius, around, known, horizon_s, first)

@@ -575,7 +575,6 @@ def compile_second_tries(robot: RobotModel) -> None:
     rest = at_rest(np.zeros(robot.nv))
     clear(robot, rest, rest, no_obstacles(), 0.0, 1.0, NO_PLANES)
     q, far = np.zeros((2, robot.nv)), np.full((1, 3), 100.0)
-    far.setflags(write=False)  # as vertices are
     course = Course(q, q, np.empty((0, 0, 2, 3)), travel_of(q, q, robot.axis_reach_m, 1.0))
     if len(robot.segments):
         _keeps_off(robot.arm.chain, course, 0, far, course.travel[0], 0.0, np.zeros(3))

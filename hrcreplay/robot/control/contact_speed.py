@@ -97,14 +97,10 @@ def select(obstacles: Obstacles, which: Bools) -> Obstacles:
     kept = np.flatnonzero(which)
     spans = [slice(obstacles.offsets[k], obstacles.offsets[k + 1]) for k in kept.tolist()]
     lengths = [span.stop - span.start for span in spans]
-    vertices_m = np.concatenate([obstacles.vertices_m[span] for span in spans]) if spans else np.empty((0, 3))
-    radius_m = obstacles.radius_m[kept]
-    for array in (vertices_m, radius_m):  # like those of one person; otherwise numba compiles all kernels again
-        array.setflags(write=False)
     return Obstacles(
-        vertices_m,
+        np.concatenate([obstacles.vertices_m[span] for span in spans]) if spans else np.empty((0, 3)),
         np.cumsum([0, *lengths]),
-        radius_m,
+        obstacles.radius_m[kept],
         obstacles.boxes_m[kept],
         obstacles.known,
         obstacles.horizon_s,

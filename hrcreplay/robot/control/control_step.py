@@ -226,6 +226,15 @@ class RobotState(NamedTuple):
     dq: Floats  #: (nv,) [rad/s]
 
 
+class Ahead(NamedTuple):
+    """Settings of ``PlanSettings.horizon_s`` as numbers for kernels."""
+
+    spare_ticks: int
+    least_s: float  #: shortest horizon of a tick's volumes [s]
+    most_s: float  #: longest one [s]
+    dt_s: float
+
+
 class QpRules(NamedTuple):
     """Settings of Eq. (66) as numbers for kernels; see ``settings.sections.Plan``."""
 
@@ -242,18 +251,6 @@ class QpRules(NamedTuple):
     dt_s: float
 
 
-class TickRules(NamedTuple):
-    """Settings of a whole tick of Eq. (66) as numbers for kernels; see ``settings.sections.Plan``."""
-
-    qp: QpRules
-    waits: Waits
-    clearance_m: float
-    lead_s: float
-    tcp_speed_max: float
-    retreat_m: float  #: largest depth inside a volume from which a robot may move out of it [m]
-    certified: bool  #: whether a step must be certified
-
-
 class PathRules(NamedTuple):
     """Settings of the methods that stay on the path as numbers for kernels; see ``settings.sections.Plan``."""
 
@@ -262,6 +259,20 @@ class PathRules(NamedTuple):
     lead_s: float
     square: bool  #: whether the right-hand side of Eq. (14) is as printed
     dt_s: float
+
+
+class TickRules(NamedTuple):
+    """Settings of a whole tick as numbers for kernels; see ``settings.sections.Plan``."""
+
+    qp: QpRules
+    path: PathRules
+    waits: Waits
+    ahead: Ahead
+    clearance_m: float
+    lead_s: float
+    tcp_speed_max: float
+    retreat_m: float  #: largest depth inside a volume from which a robot may move out of it [m]
+    certified: bool  #: whether a step must be certified
 
 
 @dataclass(frozen=True)
@@ -286,10 +297,7 @@ class PlanSettings:
         Args:
             stop: The stop from the present velocity.
         """
-        needed = (stop.ticks + 2 + self.spare_ticks) * self.dt_s
-        if self.plan.horizon == "adaptive":
-            return needed
-        return max(self.stop_s, needed) if self.certified else self.stop_s
+        return horizon_after(stop.ticks, self.tick_rules.ahead)
 
     def retreats(self, overlap_m: float) -> bool:
         """Return whether a robot whose link is ``overlap_m`` [m] inside a volume may slowly move out of it."""
@@ -315,10 +323,16 @@ class PlanSettings:
 
     @cached_property
     def tick_rules(self) -> TickRules:
-        """The settings of a whole tick of Eq. (66) as numbers."""
-        plan = self.plan
+        """The settings of a whole tick as numbers."""
+        plan, adaptive = self.plan, self.plan.horizon == "adaptive"
+        ahead = Ahead(
+            int(self.spare_ticks),
+            0.0 if adaptive else float(self.stop_s),
+            math.inf if adaptive or self.certified else float(self.stop_s),
+            float(self.dt_s),
+        )
         limits = float(plan.clearance_m), float(plan.lead_s), float(plan.tcp_speed_max), float(self.retreat_m)
-        return TickRules(self.rules, self.waits, *limits, self.certified)
+        return TickRules(self.rules, self.path_rules, self.waits, ahead, *limits, self.certified)
 
     @cached_property
     def path_rules(self) -> PathRules:
@@ -336,6 +350,12 @@ class PlanSettings:
     def without_jerk(self) -> PlanSettings:
         """The same settings without the limit on changes of the acceleration."""
         return replace(self, plan=self.plan.model_copy(update={"jerk_s": 0.0}))
+
+
+@njit(cache=True)
+def horizon_after(ticks: int, rules: Ahead) -> float:
+    """The horizon of a tick's volumes for a stop of so many ticks; see ``PlanSettings.horizon_s`` [s]."""
+    return min(max((ticks + 2 + rules.spare_ticks) * rules.dt_s, rules.least_s), rules.most_s)
 
 
 class Proposal(NamedTuple):
@@ -365,10 +385,6 @@ class Step(NamedTuple):
     tau_s: float  #: duration of the stop from the velocity of the tick [s]
     certified: bool  #: whether the step, or the stop that it continues, is clear of volumes that are still valid
     stop: Stop  #: the stop that continues at the next tick if no better step is certified
-
-    def beside(self, sight: Sight) -> Step:
-        """The step beside the people of an observation."""
-        return self._replace(**nearest_of(sight))
 
 
 class Sight(NamedTuple):
@@ -411,21 +427,6 @@ def sight_of(pose: RobotPose, finite: bool, found: NearestLink, obstacles: Obsta
     if not finite or not obstacles.known:
         return Sight(pose, None, math.nan, -1, -1, NO_HUMAN if finite else NOT_FINITE)
     return _sight(pose, found, obstacles)
-
-
-def observe_people(robot: RobotModel, pose: RobotPose, obstacles: Obstacles, clearance_m: float) -> Sight:
-    """Nearest pair of link and limb of a robot whose pose is known; see ``observe``.
-
-    Args:
-        robot: The manipulator.
-        pose: Its pose at the tick.
-        obstacles: The swept volumes of the tick.
-        clearance_m: Clearance beyond limb radius + link radius [m].
-    """
-    if not obstacles.known:
-        return Sight(pose, None, math.nan, -1, -1, NO_HUMAN)
-    hulls = obstacles.vertices_m, obstacles.offsets, obstacles.radius_m
-    return _sight(pose, measure(pose.ends_m, robot.arm.radius_m, *hulls, clearance_m), obstacles)
 
 
 def _sight(pose: RobotPose, found: NearestLink, obstacles: Obstacles) -> Sight:
@@ -487,6 +488,25 @@ def standstill_reason(sight: Sight, settings: PlanSettings) -> int:
     if sight.reason:
         return sight.reason
     return INSIDE if settings.certified and sight.overlap_m >= settings.retreat_m and sight.distance_m <= 0.0 else 0
+
+
+@njit(cache=True)
+def reason_to_stand(finite: bool, known: bool, nearest: NearestLink, certified: bool, retreat_m: float) -> int:
+    """The same for kernels, from the result of ``look``.
+
+    Args:
+        finite: Whether the robot's pose is finite.
+        known: Whether all limbs are known.
+        nearest: Distances of all pairs.
+        certified: Whether a step must be certified.
+        retreat_m: Largest depth inside a volume from which a robot may move out of it [m].
+    """
+    if not finite or not known:
+        return NO_HUMAN if finite else NOT_FINITE
+    if nearest.pairs.distance_m.size and math.isnan(nearest.surface_m):
+        return NO_DISTANCE
+    inside = nearest.surface_m <= 0.0 and max(0.0, -nearest.surface_m) >= retreat_m
+    return INSIDE if certified and inside else 0
 
 
 def motion_row(

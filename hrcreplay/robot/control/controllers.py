@@ -9,14 +9,13 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from hrcreplay.records import Floats, Ints, Motion
+from hrcreplay.records import Floats, MotionRow
 from hrcreplay.robot.control import path_controller, qp_controller
 from hrcreplay.robot.control.certificate import NO_PLANES, decide
 from hrcreplay.robot.control.contact_speed import SLOW, end_speeds, pair_speeds, select
 from hrcreplay.robot.control.control_step import (
     NO_SOLUTION,
     NOT_FINITE,
-    REASONS,
     TOO_NEAR,
     PlanSettings,
     Proposal,
@@ -31,13 +30,12 @@ from hrcreplay.robot.control.control_step import (
     make_step,
     motion_row,
     observe,
-    observe_people,
     sight_of,
     standstill_reason,
 )
 from hrcreplay.robot.control.qp_controller import QpContext
 from hrcreplay.robot.control.qp_tick import QpTick, TickHulls, TickStart, decide_at_once
-from hrcreplay.robot.control.separation import Obstacles, no_obstacles
+from hrcreplay.robot.control.separation import Obstacles
 from hrcreplay.robot.control.static_obstacles import StaticObstacles, StaticShapes, no_shapes
 from hrcreplay.robot.kinematics import Arm
 from hrcreplay.robot.model import RobotModel
@@ -51,6 +49,11 @@ class ControllerTick(NamedTuple):
     point: ReferencePoint  #: the reference at the tick
     programme_s: float  #: programmed time of the reference [s]
     step: Step
+
+    @property
+    def row(self) -> MotionRow:
+        """The row of the motion."""
+        return motion_row(self.state, self.step, self.point.T_world_tcp[:3, 3], self.point.tcp_speed, self.programme_s)
 
 
 #: Horizon from the tick on [s] -> the swept volumes of the tick that are valid until then.
@@ -137,10 +140,6 @@ class Controller(ABC):
         obstacles = predict(horizon_s)
         return obstacles, min(horizon_s, obstacles.horizon_s)  # a live session may reuse older volumes
 
-    def follow(self, outlook: Outlook, ticks: int) -> list[ControllerTick]:
-        """A batch of ticks."""
-        return [self.step(outlook.predict(tick)) for tick in range(ticks)]
-
     @abstractmethod
     def propose(self, seen: Observation) -> Proposals:
         """Proposals of the method, or the reason why there are none."""
@@ -164,8 +163,7 @@ class QpController(Controller):
             self.planes = found.planes
             first = qp_controller.proposals_of(found.stops, self.settings, held=found.held)[0]
             return seen, Taken(first.stop, first.status, 0, certified=True)
-        reason = standstill_reason(sight, self.settings)
-        return seen, self._certify(seen, reason or self._proposals(seen, found))
+        return seen, self._certify(seen, found.reason or self._proposals(seen, found))
 
     def _proposals(self, seen: Observation, found: QpTick) -> Proposals:
         """The proposals of a tick in which the kernel has certified none."""
@@ -245,16 +243,6 @@ class BlindController(PathController):
 
     careful = False
 
-    def follow(self, outlook: Outlook, ticks: int) -> list[ControllerTick]:
-        """A batch of ticks: the motion first, as it ignores people, then the people of all ticks at once."""
-        moved = [self.step(_nobody) for _ in range(ticks)]
-        people = outlook.until(np.array([tick.step.horizon_s for tick in moved]))
-        clearance_m = self.settings.plan.clearance_m
-        return [
-            tick._replace(step=tick.step.beside(observe_people(self.robot, tick.step.pose, there, clearance_m)))
-            for tick, there in zip(moved, people, strict=True)
-        ]
-
 
 class SsmController(PathController):
     """Speed and separation monitoring, ISO/TS 15066: moves while the protective separation distance is kept."""
@@ -321,10 +309,6 @@ class PflController(PathController):
         return [{"kind": "contact", "link": link, "volume": self.beside[volume], "speed_m_per_s": limits[link, volume]}]
 
 
-def _nobody(_horizon_s: float) -> Obstacles:
-    return no_obstacles()
-
-
 #: Method -> its controller.
 CONTROLLERS: dict[str, type[Controller]] = {
     "qp": QpController,
@@ -334,37 +318,3 @@ CONTROLLERS: dict[str, type[Controller]] = {
     "pfl": PflController,
     "none": BlindController,
 }
-
-
-@dataclass
-class Planner:
-    """Runs one method near the people of each tick."""
-
-    controller: Controller
-    chosen: bool  #: the run's method, not a baseline
-
-    @property
-    def robot(self) -> RobotModel:
-        """The robot."""
-        return self.controller.robot
-
-    @property
-    def static(self) -> StaticObstacles | None:
-        """Objects of the cell and pairs of links; None: there are none."""
-        return self.controller.static
-
-    @property
-    def dt_s(self) -> float:
-        """The time between two ticks [s]."""
-        return self.controller.settings.dt_s
-
-    def follow(self, t_ns: Ints, outlook: Outlook, limbs: tuple[str, ...]) -> Motion:
-        """The motion of a batch of ticks with the predicted volumes of each; ``limbs`` names all possible volumes."""
-        robot = self.controller.robot
-        ticks = self.controller.follow(outlook, len(t_ns))
-        rows = [
-            motion_row(tick.state, tick.step, tick.point.T_world_tcp[:3, 3], tick.point.tcp_speed, tick.programme_s)
-            for tick in ticks
-        ]
-        links = tuple(segment.name for segment in robot.segments)
-        return Motion.of_rows(t_ns, rows, limbs=limbs, links=links, reasons=REASONS)

@@ -94,10 +94,9 @@ def minimise(task: Problem) -> Solution | Unsolved:
 
 def compile_second_tries() -> None:
     """Compiles the kernels that run only where ``row_search`` proves no solution, so that no session compiles them."""
-    one, none, vertices = np.ones(1), np.zeros(1), np.empty((0, 3))
-    vertices.setflags(write=False)  # as vertices are
+    one, none = np.ones(1), np.zeros(1)
     limits = Limits(-one, one, np.zeros((6, 1)), -np.ones(6), np.ones(6))
-    empty = np.empty((0, 2, 3)), np.empty((0, 2, 3, 1)), vertices, np.zeros(1, np.int64), np.empty((0, 2, 3))
+    empty = np.empty((0, 2, 3)), np.empty((0, 2, 3, 1)), np.empty((0, 3)), np.zeros(1, np.int64), np.empty((0, 2, 3))
     rows = Approach(*empty, np.empty((0, 0)), np.empty((0, 0)), 1.0, np.empty((0, 1)), np.empty(0))
     task = Problem(np.eye(1), none, limits, rows, soft=False)
     at = search(task)

@@ -81,7 +81,9 @@ def propose(
     bounds = RateBounds(rows.vertices_m, rows.offsets, rows.boxes_m, pairs, speeds)
     at, rules = current_stop.along[0], settings.path_rules
     limits, slowest = (robot.dq_max, robot.ddq_max), float(current_stop.rest().along[0, 1])
-    found, slowed, q, dq, along = _propose(reference.grid, at, slowest, sight.pose, limits, bounds, horizon_s, rules)
+    found, slowed, q, dq, along = propose_rows(
+        reference.grid, at, slowest, sight.pose, limits, bounds, horizon_s, rules
+    )
     if not found:
         return control_step.NO_SOLUTION
     return [Proposal(Stop(q, dq, along), control_step.LIMITED if slowed else control_step.TRACKING)]
@@ -122,7 +124,7 @@ _NO_PAIRS = Separation(np.empty((0, 0)), np.empty((0, 0)))
 
 
 @njit(cache=True)
-def _propose(
+def propose_rows(
     grid: Grid,
     at: Floats,
     slowest: float,

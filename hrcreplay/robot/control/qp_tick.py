@@ -8,13 +8,12 @@ and the second proposal.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 from hrcreplay.kernels import njit
 from hrcreplay.records import Floats, Ints
 from hrcreplay.robot.control.certificate import RETREAT_SPEED, check
-from hrcreplay.robot.control.control_step import TickRules, look
+from hrcreplay.robot.control.control_step import TickRules, look, reason_to_stand
 from hrcreplay.robot.control.qp_controller import Instant, Stops, Target, no_stops, propose_stops, static_ahead_s
 from hrcreplay.robot.control.separation import NearestLink
 from hrcreplay.robot.control.static_obstacles import StaticShapes
@@ -50,6 +49,7 @@ class QpTick(NamedTuple):
     pose: RobotPose  #: at the tick
     finite: bool  #: whether the pose is
     nearest: NearestLink
+    reason: int  #: index into ``REASONS`` of the reason why no step is sought; 0 if there is none
     s_s: float  #: programmed time of the reference at the next tick [s]
     rate: float  #: of the reference
     point: ReferencePoint  #: the reference at the next tick
@@ -81,9 +81,8 @@ def decide_at_once(
     s_s, rate, point, cap = follow(grid, arm.chain, moment.s_s, moment.T_world_ref, pose.T_world_tcp, dt_s, rules.waits)
     solved, held, stops, clear, planes = False, False, no_stops(len(q)), False, moment.planes
     overlap_m = max(0.0, -nearest.surface_m)
-    inside = rules.certified and overlap_m >= rules.retreat_m and nearest.surface_m <= 0.0
-    lost = nearest.pairs.distance_m.size > 0 and math.isnan(nearest.surface_m)
-    if finite and people.known and not lost and not inside:
+    reason = reason_to_stand(finite, people.known, nearest, rules.certified, rules.retreat_m)
+    if not reason:
         retreats = 0.0 < overlap_m < rules.retreat_m
         speed_max = min(rules.tcp_speed_max, RETREAT_SPEED) if retreats else rules.tcp_speed_max
         target = Target(point.T_world_tcp, rate * point.twist, point.q, cap)
@@ -98,4 +97,4 @@ def decide_at_once(
                 arm, *rows, *hulls, people.radius, people.boxes, clearance_m, dt_s, planes, static
             )
             clear = done and not len(near.pairs) and not len(beside.pairs)
-    return QpTick(pose, finite, nearest, s_s, rate, point, cap, solved, held, stops, clear, planes)
+    return QpTick(pose, finite, nearest, reason, s_s, rate, point, cap, solved, held, stops, clear, planes)

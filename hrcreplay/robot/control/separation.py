@@ -49,19 +49,30 @@ def obstacles(volumes: SweptVolumes, tick: int, horizon_s: float = math.inf) -> 
     """
     limbs = len(volumes.limbs)
     offsets = volumes.offsets[tick * limbs : (tick + 1) * limbs + 1]
-    vertices, radius = volumes.vertices_m[offsets[0] : offsets[-1]], volumes.radius_m[tick]
-    offsets = offsets - offsets[0]
-    around, known = boxes(vertices, offsets, radius)
+    vertices, offsets, radius, around, known = _hulls(volumes.vertices_m, offsets, volumes.radius_m[tick])
     return Obstacles(vertices, offsets, radius, around, known, horizon_s)
+
+
+@njit(cache=True)
+def _hulls(vertices: Floats, offsets: Ints, radius: Floats) -> tuple[Floats, Ints, Floats, Floats, bool]:
+    """Copies of one tick's hulls, with their ``boxes``: a table's numbers are protected, those of ticks are not.
+
+    Kernels are compiled for one of the two.
+
+    Args:
+        vertices: (m, 3) of several ticks [m].
+        offsets: (l + 1,) index of the first vertex of each hull of the tick.
+        radius: (l,) [m].
+    """
+    own, at, thick = vertices[offsets[0] : offsets[-1]].copy(), offsets - offsets[0], radius.copy()
+    around, known = boxes(own, at, thick)
+    return own, at, thick, around, known
 
 
 @cache
 def no_obstacles() -> Obstacles:
     """No volumes, and it is known that there are none."""
-    vertices, radius = np.empty((0, 3)), np.empty(0)
-    for array in (vertices, radius):  # like those of people; otherwise numba compiles all kernels again
-        array.setflags(write=False)
-    return Obstacles(vertices, np.zeros(1, np.int64), radius, np.empty((0, 2, 3)), known=True)
+    return Obstacles(np.empty((0, 3)), np.zeros(1, np.int64), np.empty(0), np.empty((0, 2, 3)), known=True)
 
 
 def join_obstacles(people: Sequence[Obstacles]) -> Obstacles:
@@ -70,13 +81,10 @@ def join_obstacles(people: Sequence[Obstacles]) -> Obstacles:
         return people[0]
     ends = np.cumsum([0, *(one.offsets[-1] for one in people)])
     offsets = [one.offsets[1:] + end for one, end in zip(people, ends[:-1], strict=True)]
-    vertices, radius = (np.concatenate([getattr(one, name) for one in people]) for name in ("vertices_m", "radius_m"))
-    for array in (vertices, radius):  # like those of one person; otherwise numba compiles all kernels again
-        array.setflags(write=False)
     return Obstacles(
-        vertices,
+        np.concatenate([one.vertices_m for one in people]),
         np.concatenate([np.zeros(1, np.int64), *offsets]),
-        radius,
+        np.concatenate([one.radius_m for one in people]),
         np.concatenate([one.boxes_m for one in people]),
         all(one.known for one in people),
         min(one.horizon_s for one in people),

@@ -63,10 +63,8 @@ class StaticShapes(NamedTuple):
 @lru_cache
 def no_shapes(links: int, axes: int) -> StaticShapes:
     """Nothing to keep clear of beside people, for a robot with so many links and axes."""
-    vertices, pairs = np.empty((0, 3)), np.empty((0, 2), np.int64)
-    vertices.setflags(write=False)
-    hulls = vertices, np.zeros(1, np.int64), np.empty((0, 2, 3)), np.empty((links, 0))
-    return StaticShapes(*hulls, pairs, np.empty(0), np.empty((axes, 0)))
+    hulls = np.empty((0, 3)), np.zeros(1, np.int64), np.empty((0, 2, 3)), np.empty((links, 0))
+    return StaticShapes(*hulls, np.empty((0, 2), np.int64), np.empty(0), np.empty((axes, 0)))
 
 
 @dataclass(frozen=True)
@@ -89,9 +87,7 @@ class StaticObstacles:
     @cached_property
     def shapes(self) -> StaticShapes:
         """Hulls and pairs of links as numbers for kernels."""
-        vertices = self.vertices_m.view()
-        vertices.setflags(write=False)  # like those of people; otherwise numba compiles all kernels again
-        hulls = vertices, self.offsets, self.boxes_m, self.keep_m
+        hulls = self.vertices_m, self.offsets, self.boxes_m, self.keep_m
         return StaticShapes(*hulls, self.pairs, self.pair_keep_m, self.pair_reach_m)
 
 

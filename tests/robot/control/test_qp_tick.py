@@ -124,7 +124,6 @@ def test_unknown_people_and_nobody_are_those_of_python(robot: RobotModel) -> Non
     unknown = replace(near[0], known=False)
     outside = replace(near[0], horizon_s=0.001)  # no stop ends in time
     lost = replace(near[0], vertices_m=np.full_like(near[0].vertices_m, np.nan))
-    lost.vertices_m.setflags(write=False)
     people = [no_obstacles()] * 60 + near[:60] + [unknown] * 20 + [outside] * 20 + [lost] * 20 + near[60:120]
     settings = PlanSettings(Plan(), dt_s=DT_S, stop_s=STOP_S, retreat_m=0.03)
     counts = run(QpController(robot, path, settings), people)

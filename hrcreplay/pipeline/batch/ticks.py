@@ -1,0 +1,205 @@
+"""A batch of ticks in one kernel: in each the people's volumes, the decision of a method, and the row of the motion.
+
+It gives the numbers of the stages in Python, bit by bit, at a quarter of their time: between two ticks nothing is
+converted. It ends before the first tick that a kernel does not decide alone, which Python then takes.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hrcreplay.geometry.hull_reduction import Surface
+from hrcreplay.geometry.vectors import norm_n
+from hrcreplay.human.prediction.sound_volumes import SoundRows, SoundRules, sweep_sound
+from hrcreplay.kernels import njit
+from hrcreplay.records import Bools, Floats, Ints
+from hrcreplay.robot.control.control_step import LIMITED, TRACKING, TickRules, horizon_after
+from hrcreplay.robot.control.path_tick import Decision, Rows, decide_on_path, go_on
+from hrcreplay.robot.control.qp_tick import TickHulls, TickStart, decide_at_once
+from hrcreplay.robot.control.separation import NearestLink, boxes
+from hrcreplay.robot.control.static_obstacles import StaticShapes
+from hrcreplay.robot.kinematics import Arm, RobotPose
+from hrcreplay.robot.task import Grid, ReferencePoint, sample
+
+#: A tick for the kernel: all people are known, or the newest frame of one is too old; or it is left to Python.
+KNOWN, TOO_OLD, LEFT = range(3)
+
+
+class PeopleAhead(NamedTuple):
+    """The people of a batch of ticks, prepared for volumes at any horizon."""
+
+    rows: SoundRows
+    first: Ints  #: (n + 1,) first row of each tick
+    number: Ints  #: number of each row's person
+    what: Ints  #: (n,) KNOWN, TOO_OLD or LEFT
+    rules: SoundRules
+    work: Surface
+    latency_s: float  #: from the newest capture to the robot's reaction [s]
+
+
+class Way(NamedTuple):
+    """A method as numbers."""
+
+    by_qp: bool  #: Eq. (66); otherwise along the path
+    careful: bool  #: whether people matter
+    by_rows: bool  #: whether the rows of Eq. (66i) bound the rate along the path
+
+
+class Moving(NamedTuple):
+    """Robot and reference when a tick begins."""
+
+    start: TickStart
+    along: Floats  #: (m, 2) programmed time [s] and rate of the rows of its stop; NaN if it is not on its path
+    point: ReferencePoint  #: the reference
+
+
+class MotionColumns(NamedTuple):
+    """Rows of ``Motion`` that are being filled; fields as in ``MotionRow``."""
+
+    q: Floats
+    dq: Floats
+    u: Floats
+    ref_m: Floats
+    tcp_m: Floats
+    tcp_speed: Floats
+    ref_speed: Floats
+    programme_s: Floats
+    distance_m: Floats
+    overlap_m: Floats
+    limb: Ints
+    link: Ints
+    status: Ints
+    reason: Ints  #: index into ``REASONS``
+    horizon_s: Floats
+    tau_s: Floats
+    certified: Bools
+
+
+def empty_columns(ticks: int, axes: int) -> MotionColumns:
+    """Columns for so many ticks of a robot with so many axes."""
+    numbers: dict[str, Any] = {name: np.empty(ticks) for name in MotionColumns._fields}
+    numbers |= {name: np.empty((ticks, axes)) for name in ("q", "dq", "u")}
+    numbers |= {name: np.empty((ticks, 3)) for name in ("ref_m", "tcp_m")}
+    whole = {name: np.empty(ticks, np.int64) for name in ("limb", "link", "status", "reason")}
+    return MotionColumns(**numbers | whole | {"certified": np.empty(ticks, np.bool_)})
+
+
+@njit(cache=True)
+def run_ticks(
+    arm: Arm,
+    grid: Grid,
+    rules: TickRules,
+    static: StaticShapes,
+    way: Way,
+    people: PeopleAhead,
+    moving: Moving,
+    found: MotionColumns,
+    tick: int,
+) -> tuple[int, Moving]:
+    """Moves a robot tick by tick, until the end of the batch or a tick that is left to Python.
+
+    Args:
+        arm: The manipulator.
+        grid: The programmed path.
+        rules: Weights and limits.
+        static: Objects of the cell and pairs of links.
+        way: The method.
+        people: The people of the batch.
+        moving: Robot and reference at the first tick; a robot along its path is on it.
+        found: Receives the rows.
+        tick: First tick.
+
+    Returns:
+        The first tick that is not done, and robot and reference then.
+    """
+    while tick < len(found.status) and people.what[tick] != LEFT:
+        start = moving.start
+        horizon_s = horizon_after(len(start.stop_q) - 1, rules.ahead)
+        hulls = _hulls(people, tick, horizon_s)
+        if way.by_qp:
+            seen = decide_at_once(arm, grid, rules, static, start, hulls)
+            if not (seen.clear or seen.reason):
+                break
+            now = Rows(start.stop_q, start.stop_dq, moving.along)
+            if seen.clear:
+                q, dq, along = seen.stops.straight
+                taken = Decision(Rows(q, dq, along), LIMITED if seen.held else TRACKING, 0, True)
+            else:
+                taken = go_on(now, seen.reason, rules.certified)
+            pose, nearest, s_s, point, planes = seen.pose, seen.nearest, seen.s_s, seen.point, seen.planes
+        else:
+            heeds = way.careful, way.by_rows
+            there = decide_on_path(arm, grid, rules, heeds, static, start, moving.along, hulls)
+            if not there.decided:
+                break
+            taken, pose, nearest, planes = there.decision, there.pose, there.nearest, there.planes
+            s_s = taken.rows.along[0, 0]
+            point = sample(grid, arm.chain, s_s)
+        _write(found, tick, moving, pose, nearest, taken, horizon_s, rules.qp.dt_s)
+        found.limb[tick] = _index(people, tick, nearest)
+        rows = taken.rows
+        start = TickStart(rows.q, rows.dq, found.u[tick].copy(), s_s, point.T_world_tcp, planes)
+        moving = Moving(start, rows.along, point)
+        tick += 1
+    return tick, moving
+
+
+@njit(cache=True, inner=True)
+def _hulls(people: PeopleAhead, tick: int, horizon_s: float) -> TickHulls:
+    """The volumes of a tick, as far as they are known."""
+    first, last = people.first[tick], people.first[tick + 1]
+    span_s = np.full(last - first, horizon_s + people.latency_s)
+    vertices, offsets, radii = sweep_sound(people.rows, first, last, span_s, people.rules, people.work)
+    radius = radii.reshape(-1)
+    around, known = boxes(vertices, offsets, radius)
+    return TickHulls(vertices, offsets, radius, around, known and people.what[tick] == KNOWN, horizon_s)
+
+
+@njit(cache=True, inner=True)
+def _index(people: PeopleAhead, tick: int, nearest: NearestLink) -> int:
+    """Index of the nearest volume among all possible ones, as ``Surroundings.names_of`` orders them; -1 without one."""
+    if math.isnan(nearest.surface_m):
+        return -1
+    each = people.rows.radii.shape[1]
+    number = people.number[people.first[tick] + nearest.limb // each]
+    return int((number - 1) * each + nearest.limb % each)
+
+
+@njit(cache=True, inner=True)
+def _write(
+    found: MotionColumns,
+    tick: int,
+    moving: Moving,
+    pose: RobotPose,
+    nearest: NearestLink,
+    taken: Decision,
+    horizon_s: float,
+    dt_s: float,
+) -> None:
+    """Writes the row of a tick but for the limb, as ``make_step`` and ``motion_row`` make it.
+
+    Args:
+        found: Receives it.
+        tick: The tick.
+        moving: Robot and reference.
+        pose: The robot's pose.
+        nearest: Distances from people.
+        taken: The motion executed.
+        horizon_s: Horizon of the volumes [s].
+        dt_s: Length of a tick [s].
+    """
+    start, point, surface_m = moving.start, moving.point, nearest.surface_m
+    found.q[tick], found.dq[tick] = start.stop_q[0], start.stop_dq[0]
+    found.u[tick] = (taken.rows.dq[0] - start.stop_dq[0]) / dt_s
+    found.ref_m[tick], found.ref_speed[tick] = point.T_world_tcp[:3, 3], norm_n(point.twist[:3])
+    found.tcp_m[tick], found.tcp_speed[tick] = pose.T_world_tcp[:3, 3], norm_n(pose.twist_tcp[:3])
+    found.programme_s[tick] = start.s_s
+    apart = not math.isnan(surface_m)
+    found.distance_m[tick] = (surface_m if surface_m > 0.0 else 0.0) if apart else np.nan
+    found.overlap_m[tick] = (-surface_m if surface_m < 0.0 else 0.0) if apart else np.nan
+    found.link[tick] = nearest.link if apart else -1
+    found.status[tick], found.reason[tick], found.certified[tick] = taken.status, taken.reason, taken.certified
+    found.horizon_s[tick], found.tau_s[tick] = horizon_s, (len(start.stop_q) - 1) * dt_s
