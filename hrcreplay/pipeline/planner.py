@@ -9,7 +9,7 @@ import numpy as np
 from hrcreplay.pipeline.batch.ticks import MotionColumns, Moving, PeopleAhead, Way, empty_columns, run_ticks
 from hrcreplay.pipeline.surroundings import Forecast
 from hrcreplay.records import Ints, Motion
-from hrcreplay.robot.control.control_step import REASONS, Stop
+from hrcreplay.robot.control.control_step import REASONS
 from hrcreplay.robot.control.controllers import (
     BlindController,
     Controller,
@@ -77,12 +77,11 @@ class Planner:
         if not way.by_qp and np.isnan(own.stop.along[0, 0]):
             return tick  # it continues the stop of another method
         shapes = no_shapes(len(self.robot.segments), self.robot.nv) if static is None else static.shapes
-        start = TickStart(own.stop.q, own.stop.dq, own.u, own.s_s, own.point.T_world_tcp, own.planes)
-        moving, rules = Moving(start, own.stop.along, own.point), own.settings.tick_rules
+        start = TickStart(own.stop, own.u, own.s_s, own.point.T_world_tcp, own.planes)
+        moving, rules = Moving(start, own.point), own.settings.tick_rules
         arm, grid = self.robot.arm, own.reference.grid
         done, moving = run_ticks(arm, grid, rules, shapes, way, people, moving, columns, tick)
-        (q, dq, own.u, own.s_s, _, own.planes), along, own.point = moving
-        own.stop = Stop(q, dq, along)
+        (own.stop, own.u, own.s_s, _, own.planes), own.point = moving
         return done
 
     def _step(self, outlook: Forecast, tick: int, columns: MotionColumns) -> None:

@@ -16,8 +16,8 @@ from hrcreplay.geometry.vectors import norm_n
 from hrcreplay.human.prediction.sound_volumes import SoundRows, SoundRules, sweep_sound
 from hrcreplay.kernels import njit
 from hrcreplay.records import Bools, Floats, Ints
-from hrcreplay.robot.control.control_step import LIMITED, TRACKING, TickRules, horizon_after
-from hrcreplay.robot.control.path_tick import Decision, Rows, decide_on_path, go_on
+from hrcreplay.robot.control.control_step import Taken, TickRules, horizon_after
+from hrcreplay.robot.control.path_tick import decide_on_path
 from hrcreplay.robot.control.qp_tick import TickHulls, TickStart, decide_at_once
 from hrcreplay.robot.control.separation import NearestLink, boxes
 from hrcreplay.robot.control.static_obstacles import StaticShapes
@@ -52,7 +52,6 @@ class Moving(NamedTuple):
     """Robot and reference when a tick begins."""
 
     start: TickStart
-    along: Floats  #: (m, 2) programmed time [s] and rate of the rows of its stop; NaN if it is not on its path
     point: ReferencePoint  #: the reference
 
 
@@ -117,32 +116,26 @@ def run_ticks(
     """
     while tick < len(found.status) and people.what[tick] != LEFT:
         start = moving.start
-        horizon_s = horizon_after(len(start.stop_q) - 1, rules.ahead)
+        horizon_s = horizon_after(len(start.stop.q) - 1, rules.ahead)
         hulls = _hulls(people, tick, horizon_s)
         if way.by_qp:
             seen = decide_at_once(arm, grid, rules, static, start, hulls)
-            if not (seen.clear or seen.reason):
+            if not seen.decided:
                 break
-            now = Rows(start.stop_q, start.stop_dq, moving.along)
-            if seen.clear:
-                q, dq, along = seen.stops.straight
-                taken = Decision(Rows(q, dq, along), LIMITED if seen.held else TRACKING, 0, True)
-            else:
-                taken = go_on(now, seen.reason, rules.certified)
-            pose, nearest, s_s, point, planes = seen.pose, seen.nearest, seen.s_s, seen.point, seen.planes
+            taken, pose, nearest, planes = seen.taken, seen.pose, seen.nearest, seen.planes
+            s_s, point = seen.s_s, seen.point
         else:
             heeds = way.careful, way.by_rows
-            there = decide_on_path(arm, grid, rules, heeds, static, start, moving.along, hulls)
+            there = decide_on_path(arm, grid, rules, heeds, static, start, hulls)
             if not there.decided:
                 break
-            taken, pose, nearest, planes = there.decision, there.pose, there.nearest, there.planes
-            s_s = taken.rows.along[0, 0]
+            taken, pose, nearest, planes = there.taken, there.pose, there.nearest, there.planes
+            s_s = taken.stop.along[0, 0]
             point = sample(grid, arm.chain, s_s)
         _write(found, tick, moving, pose, nearest, taken, horizon_s, rules.qp.dt_s)
         found.limb[tick] = _index(people, tick, nearest)
-        rows = taken.rows
-        start = TickStart(rows.q, rows.dq, found.u[tick].copy(), s_s, point.T_world_tcp, planes)
-        moving = Moving(start, rows.along, point)
+        start = TickStart(taken.stop, found.u[tick].copy(), s_s, point.T_world_tcp, planes)
+        moving = Moving(start, point)
         tick += 1
     return tick, moving
 
@@ -175,7 +168,7 @@ def _write(
     moving: Moving,
     pose: RobotPose,
     nearest: NearestLink,
-    taken: Decision,
+    taken: Taken,
     horizon_s: float,
     dt_s: float,
 ) -> None:
@@ -192,8 +185,8 @@ def _write(
         dt_s: Length of a tick [s].
     """
     start, point, surface_m = moving.start, moving.point, nearest.surface_m
-    found.q[tick], found.dq[tick] = start.stop_q[0], start.stop_dq[0]
-    found.u[tick] = (taken.rows.dq[0] - start.stop_dq[0]) / dt_s
+    found.q[tick], found.dq[tick] = start.stop.q[0], start.stop.dq[0]
+    found.u[tick] = (taken.stop.dq[0] - start.stop.dq[0]) / dt_s
     found.ref_m[tick], found.ref_speed[tick] = point.T_world_tcp[:3, 3], norm_n(point.twist[:3])
     found.tcp_m[tick], found.tcp_speed[tick] = pose.T_world_tcp[:3, 3], norm_n(pose.twist_tcp[:3])
     found.programme_s[tick] = start.s_s
@@ -202,4 +195,4 @@ def _write(
     found.overlap_m[tick] = (-surface_m if surface_m < 0.0 else 0.0) if apart else np.nan
     found.link[tick] = nearest.link if apart else -1
     found.status[tick], found.reason[tick], found.certified[tick] = taken.status, taken.reason, taken.certified
-    found.horizon_s[tick], found.tau_s[tick] = horizon_s, (len(start.stop_q) - 1) * dt_s
+    found.horizon_s[tick], found.tau_s[tick] = horizon_s, (len(start.stop.q) - 1) * dt_s

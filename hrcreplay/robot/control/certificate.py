@@ -48,7 +48,7 @@ from hrcreplay.robot.control.control_step import (
 )
 from hrcreplay.robot.control.separation import Obstacles, no_obstacles
 from hrcreplay.robot.control.static_obstacles import StaticObstacles, StaticShapes, no_shapes
-from hrcreplay.robot.kinematics import Arm, Chain, ends_at
+from hrcreplay.robot.kinematics import Arm, Chain, ends_at, motion_of_links
 from hrcreplay.robot.model import RobotModel
 
 #: Rounding tolerance of the check that a link moves away [m^2/s].
@@ -81,8 +81,8 @@ NO_PLANES: Floats = np.zeros((0, 0, 3))
 
 
 #: Verdicts of `clear`: not certified; clear of every volume; moving away from the volumes that a link is inside, and
-#: clear of all others.
-REFUSED, CLEAR, OPENING = range(3)
+#: clear of all others. `judge` may also find none, as coal must be asked.
+REFUSED, CLEAR, OPENING, UNDECIDED = range(4)
 
 #: Speed limit of a robot that moves out of a volume: the reduced speed of ISO 10218 [m/s].
 RETREAT_SPEED = 0.25
@@ -263,6 +263,61 @@ def check(
     between = _check_links(arm.chain, course, static, travel_of(q, dq, static.pair_reach, dt_s))
     both = Unproven(np.concatenate((beside.pairs, between.pairs)), np.concatenate((beside.results, between.results)))
     return True, course, planes, people, both
+
+
+@njit(cache=True, inner=True)
+def judge(
+    arm: Arm,
+    now: Stop,
+    after: Stop,
+    vertices: Floats,
+    offsets: Ints,
+    radius: Floats,
+    boxes: Floats,
+    clearance_m: float,
+    dt_s: float,
+    planes: Floats,
+    retreat_m: float,
+    static: StaticShapes,
+) -> tuple[int, Floats]:
+    """The verdict of `clear` and the planes for the next tick, for kernels; UNDECIDED where coal must be asked.
+
+    Args:
+        arm: The manipulator.
+        now: The current stop; the step begins at its row 0.
+        after: The stop that begins at the end of the step.
+        vertices: (v, 3) of all limbs [m].
+        offsets: (l + 1,) index of each limb's first vertex.
+        radius: (l,) of the limbs' balls [m].
+        boxes: (l, 2, 3) boxes around the limbs' vertices [m].
+        clearance_m: Clearance beyond limb radius + link radius [m].
+        dt_s: Length of a tick [s].
+        planes: Planes of the previous tick, as in ``clear``.
+        retreat_m: Largest depth inside a volume from which a link may move out of it [m].
+        static: Objects of the cell and pairs of links.
+    """
+    rows = now.q, now.dq, after.q, after.dq
+    done, course, planes, near, beside = check(
+        arm, *rows, vertices, offsets, radius, boxes, clearance_m, dt_s, planes, static
+    )
+    if not done:
+        return REFUSED, planes
+    verdict, keep = CLEAR, _kept(arm, radius, clearance_m)
+    for i in range(len(near.pairs)):
+        link, limb = near.pairs[i]
+        hull = vertices[offsets[limb] : offsets[limb + 1]]
+        if near.results[i] == OPEN:
+            return UNDECIDED, planes
+        gap = _gap(course.ends[0, link, 0], course.ends[0, link, 1], planes[link, limb], hull) - keep[link, limb]
+        if not -retreat_m < gap <= 0.0:
+            return REFUSED, planes
+        ends, twists = motion_of_links(arm.chain, course.q, course.dq)
+        if not _moves_away(ends[:, link], twists[:, link], hull):
+            return REFUSED, planes
+        verdict = OPENING
+    if len(beside.pairs):
+        verdict = REFUSED if (beside.results == TOO_CLOSE).any() else UNDECIDED
+    return verdict, planes
 
 
 @njit(cache=True)

@@ -509,6 +509,20 @@ def reason_to_stand(finite: bool, known: bool, nearest: NearestLink, certified: 
     return INSIDE if certified and inside else 0
 
 
+@njit(cache=True)
+def go_on(stop: Stop, reason: int, certified: bool) -> Taken:
+    """The motion where no step is taken: the current stop goes on; for kernels, as in ``certificate.decide``.
+
+    Args:
+        stop: The current stop; row 0 is the state of the robot.
+        reason: Why, index into ``REASONS``.
+        certified: Whether a step must be certified.
+    """
+    rests = len(stop.q) == 1
+    status = LIMITED if rests and reason not in (NO_HUMAN, NOT_FINITE) else BRAKING
+    return Taken(stop if rests else Stop(stop.q[1:], stop.dq[1:], stop.along[1:]), status, reason, certified or rests)
+
+
 def motion_row(
     state: RobotState, step: Step, ref_m: Floats, ref_speed: float, programme_s: float, reason: str | None = None
 ) -> MotionRow:

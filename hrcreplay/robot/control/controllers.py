@@ -159,14 +159,13 @@ class QpController(Controller):
         sight = sight_of(found.pose, found.finite, found.nearest, obstacles)
         seen = Observation(sight, obstacles, horizon_s, predict)
         self.s_s, self.point = found.s_s, found.point
-        if found.clear:
+        if found.decided:
             self.planes = found.planes
-            first = qp_controller.proposals_of(found.stops, self.settings, held=found.held)[0]
-            return seen, Taken(first.stop, first.status, 0, certified=True)
-        return seen, self._certify(seen, found.reason or self._proposals(seen, found))
+            return seen, found.taken
+        return seen, self._certify(seen, self._proposals(seen, found))
 
     def _proposals(self, seen: Observation, found: QpTick) -> Proposals:
-        """The proposals of a tick in which the kernel has certified none."""
+        """The proposals of a tick that the kernel has not decided."""
         if found.solved:
             return qp_controller.proposals_of(found.stops, self.settings, held=found.held)
         return qp_controller.try_again(self._context(seen, found.rate, found.tcp_speed_max), self.settings)
@@ -196,7 +195,7 @@ class QpController(Controller):
         """The input of a tick as numbers for the kernel."""
         robot, static, stop = self.robot, self.static, self.stop
         shapes = no_shapes(len(robot.segments), robot.nv) if static is None else static.shapes
-        moment = TickStart(stop.q, stop.dq, self.u, self.s_s, self.point.T_world_tcp, self.planes)
+        moment = TickStart(stop, self.u, self.s_s, self.point.T_world_tcp, self.planes)
         hulls = obstacles.vertices_m, obstacles.offsets, obstacles.radius_m, obstacles.boxes_m
         people = TickHulls(*hulls, obstacles.known, horizon_s)
         return robot.arm, self.reference.grid, self.settings.tick_rules, shapes, moment, people

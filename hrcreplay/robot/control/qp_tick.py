@@ -2,8 +2,7 @@
 
 A call of a kernel from Python converts every array, which takes as long as much of the work of a tick. So the kernels
 of a tick are called by one kernel here. It gives the numbers of those kernels, bit by bit, and leaves to Python what a
-tick rarely needs: a problem that ``row_search`` does not solve, a motion that is not certified without coal, a retreat,
-and the second proposal.
+tick rarely needs: a problem that ``row_search`` does not solve, and a motion about which coal is asked.
 """
 
 from __future__ import annotations
@@ -12,8 +11,20 @@ from typing import NamedTuple
 
 from hrcreplay.kernels import njit
 from hrcreplay.records import Floats, Ints
-from hrcreplay.robot.control.certificate import RETREAT_SPEED, check
-from hrcreplay.robot.control.control_step import TickRules, look, reason_to_stand
+from hrcreplay.robot.control.certificate import CLEAR, OPENING, RETREAT_SPEED, UNDECIDED, judge
+from hrcreplay.robot.control.control_step import (
+    INSIDE,
+    LIMITED,
+    NOT_CERTIFIED,
+    RETREATING,
+    TRACKING,
+    Stop,
+    Taken,
+    TickRules,
+    go_on,
+    look,
+    reason_to_stand,
+)
 from hrcreplay.robot.control.qp_controller import Instant, Stops, Target, no_stops, propose_stops, static_ahead_s
 from hrcreplay.robot.control.separation import NearestLink
 from hrcreplay.robot.control.static_obstacles import StaticShapes
@@ -24,8 +35,7 @@ from hrcreplay.robot.task import Grid, ReferencePoint, follow
 class TickStart(NamedTuple):
     """Robot and reference when the tick begins."""
 
-    stop_q: Floats  #: (m, nv) the current stop; row 0 is the state of the robot [rad]
-    stop_dq: Floats  #: (m, nv) [rad/s]
+    stop: Stop  #: the current stop; row 0 is the state of the robot
     u_before: Floats  #: (nv,) acceleration of the previous tick [rad/s^2]
     s_s: float  #: programmed time of the reference [s]
     T_world_ref: Floats  #: (4, 4) the reference at that time
@@ -57,8 +67,9 @@ class QpTick(NamedTuple):
     solved: bool  #: whether ``row_search`` proves the minimiser of Eq. (66)
     held: bool  #: whether a row of people or objects holds it
     stops: Stops  #: the stops after it; empty if it is not solved
-    clear: bool  #: whether the first of them is certified
-    planes: Floats  #: for the next tick, if it is
+    decided: bool  #: False: Python decides
+    taken: Taken  #: the motion that the robot executes, if it is decided
+    planes: Floats  #: for the next tick, if it is decided
 
 
 @njit(cache=True)
@@ -75,26 +86,64 @@ def decide_at_once(
         moment: Robot and reference when the tick begins.
         people: Their volumes.
     """
-    q, dq, dt_s, clearance_m = moment.stop_q[0], moment.stop_dq[0], rules.qp.dt_s, rules.clearance_m
-    hulls = people.vertices, people.offsets
-    pose, finite, nearest = look(arm, q, dq, *hulls, people.radius, people.known, clearance_m)
+    stop, dt_s, hulls = moment.stop, rules.qp.dt_s, (people.vertices, people.offsets)
+    q, dq = stop.q[0], stop.dq[0]
+    pose, finite, nearest = look(arm, q, dq, *hulls, people.radius, people.known, rules.clearance_m)
     s_s, rate, point, cap = follow(grid, arm.chain, moment.s_s, moment.T_world_ref, pose.T_world_tcp, dt_s, rules.waits)
-    solved, held, stops, clear, planes = False, False, no_stops(len(q)), False, moment.planes
-    overlap_m = max(0.0, -nearest.surface_m)
     reason = reason_to_stand(finite, people.known, nearest, rules.certified, rules.retreat_m)
+    solved, held, stops, decided = False, False, no_stops(len(q)), reason != 0
+    taken, planes = go_on(stop, reason, rules.certified), moment.planes
     if not reason:
-        retreats = 0.0 < overlap_m < rules.retreat_m
+        retreats = 0.0 < -nearest.surface_m < rules.retreat_m
         speed_max = min(rules.tcp_speed_max, RETREAT_SPEED) if retreats else rules.tcp_speed_max
         target = Target(point.T_world_tcp, rate * point.twist, point.q, cap)
         ahead_s = people.horizon_s + rules.lead_s, static_ahead_s(people.horizon_s, rules.qp.smooth_s)
         now = Instant(q, dq, moment.u_before, target, pose, nearest.pairs, *hulls, people.boxes, *ahead_s, speed_max)
         solved, held, stops = propose_stops(arm, rules.qp, now, static)
-        after_q, after_dq, _ = stops.straight
-        in_time = len(after_q) * dt_s <= people.horizon_s + 1e-9
-        if solved and rules.certified and in_time:
-            rows = moment.stop_q, moment.stop_dq, after_q, after_dq
-            done, _, planes, near, beside = check(
-                arm, *rows, *hulls, people.radius, people.boxes, clearance_m, dt_s, planes, static
-            )
-            clear = done and not len(near.pairs) and not len(beside.pairs)
-    return QpTick(pose, finite, nearest, reason, s_s, rate, point, cap, solved, held, stops, clear, planes)
+        if solved and rules.certified:
+            decided, taken, planes = _decide(arm, rules, stop, stops, held, people, planes, static)
+    return QpTick(pose, finite, nearest, reason, s_s, rate, point, cap, solved, held, stops, decided, taken, planes)
+
+
+@njit(cache=True, inner=True)
+def _decide(
+    arm: Arm,
+    rules: TickRules,
+    now: Stop,
+    stops: Stops,
+    held: bool,
+    people: TickHulls,
+    planes: Floats,
+    static: StaticShapes,
+) -> tuple[bool, Taken, Floats]:
+    """What ``certificate.decide`` takes of the stops after a solution, as far as it does not ask coal.
+
+    Args:
+        arm: The manipulator.
+        rules: Limits.
+        now: The current stop.
+        stops: The stops after the solution.
+        held: Whether a row of people or objects holds it.
+        people: Their volumes.
+        planes: Planes of the previous tick.
+        static: Objects of the cell and pairs of links.
+
+    Returns:
+        Whether it is decided, the motion, and the planes for the next tick.
+    """
+    reason, dt_s, hulls = NOT_CERTIFIED, rules.qp.dt_s, (people.vertices, people.offsets, people.radius, people.boxes)
+    for which in range(2):
+        q, dq, along = stops.straight if which == 0 else stops.axis_by_axis
+        if len(q) * dt_s > people.horizon_s + 1e-9:
+            continue
+        after, limits = Stop(q, dq, along), (rules.clearance_m, dt_s)
+        verdict, planes = judge(arm, now, after, *hulls, *limits, planes, rules.retreat_m, static)
+        if verdict == UNDECIDED:
+            return False, go_on(now, reason, True), planes
+        if verdict == CLEAR:
+            return True, Taken(after, LIMITED if held else TRACKING, 0, True), planes
+        if verdict == OPENING:
+            if len(q) > 1 or len(now.q) > 1:
+                return True, Taken(after, RETREATING, 0, True), planes
+            reason = INSIDE
+    return True, go_on(now, reason, True), planes

@@ -11,7 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hrcreplay.robot.control.control_step import PlanSettings
+from hrcreplay.robot.control.control_step import (
+    BRAKING,
+    INSIDE,
+    LIMITED,
+    NO_HUMAN,
+    NOT_CERTIFIED,
+    RETREATING,
+    TRACKING,
+    PlanSettings,
+)
 from hrcreplay.robot.control.controllers import Controller, QpController
 from hrcreplay.robot.control.qp_tick import decide_at_once
 from hrcreplay.robot.control.separation import Obstacles, no_obstacles, obstacles
@@ -61,9 +70,9 @@ def in_python(controller: QpController, seen: Obstacles) -> tuple[Any, Any, QpCo
     return seen_there[:3], taken, other
 
 
-def run(controller: QpController, people: list[Obstacles]) -> Counter[tuple[bool, int]]:
-    """Compares every tick; counts (certified by the kernel, reason)."""
-    counts: Counter[tuple[bool, int]] = Counter()
+def run(controller: QpController, people: list[Obstacles]) -> Counter[tuple[bool, int, int]]:
+    """Compares every tick; counts (decided by the kernel, reason, status)."""
+    counts: Counter[tuple[bool, int, int]] = Counter()
     asked = []
 
     def listening(*given: Any) -> Any:
@@ -81,7 +90,7 @@ def run(controller: QpController, people: list[Obstacles]) -> Counter[tuple[bool
             assert_same((*pieces(seen_here[:3]), *pieces(mine)), expected)
             assert_same((own.planes, own.s_s, own.point), (after.planes, after.s_s, after.point))
             controller.step(lambda _, seen=seen: seen)  # type: ignore[misc]
-            counts[asked[-1].clear, mine.reason] += 1
+            counts[asked[-1].decided, mine.reason, mine.status] += 1
     return counts
 
 
@@ -114,9 +123,14 @@ def test_a_tick_in_one_kernel_is_the_tick_in_python(
     path = plan_programme(parse_task(TO_AND_FRO), robot)
     counts = run(QpController(robot, path, settings, static=beside(robot) if objects else None), approaching())
     assert sum(counts.values()) == TICKS
-    at_once = sum(count for (clear, _), count in counts.items() if clear)
-    assert (at_once > 50) == certified, counts
-    assert TICKS - at_once > 20, counts
+    at_once = Counter({(reason, status): count for (decided, reason, status), count in counts.items() if decided})
+    if certified:
+        assert TICKS - 5 > at_once.total() > 0.9 * TICKS, counts
+        assert at_once[0, TRACKING] > 50 < max(at_once[INSIDE, LIMITED], at_once[0, RETREATING]), counts
+        assert at_once[0, RETREATING] > 0 or plan.get("rows") == "hard", counts
+        assert at_once[NOT_CERTIFIED, BRAKING] + at_once[NOT_CERTIFIED, LIMITED] > 0, counts
+    else:
+        assert not any(reason == 0 for reason, _ in at_once), counts
 
 
 def test_unknown_people_and_nobody_are_those_of_python(robot: RobotModel) -> None:
@@ -127,4 +141,4 @@ def test_unknown_people_and_nobody_are_those_of_python(robot: RobotModel) -> Non
     people = [no_obstacles()] * 60 + near[:60] + [unknown] * 20 + [outside] * 20 + [lost] * 20 + near[60:120]
     settings = PlanSettings(Plan(), dt_s=DT_S, stop_s=STOP_S, retreat_m=0.03)
     counts = run(QpController(robot, path, settings), people)
-    assert {reason for _, reason in counts} >= {0, 1, 5}, counts
+    assert {reason for _, reason, _ in counts} >= {0, NO_HUMAN, NOT_CERTIFIED}, counts
