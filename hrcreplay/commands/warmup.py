@@ -49,15 +49,18 @@ def compile_part(part: str) -> None:
 
 
 def _compile_person(scratch: Path) -> None:
-    """Fusion and smoothing, the printed predictions, and a robot on its path beside the recorded person."""
+    """Fusion and smoothing, a robot on its path beside the recorded person, and the printed predictions.
+
+    The other process needs what such a robot needs once it has compiled ``qp``, so it must not come last.
+    """
     from hrcreplay.evaluation.contact import write_contact
 
     how: Any = {"cell_file": replay.demo_cell(), **_SPAN}
     fused = replay.run("fuse", replay.demo_log(), out=scratch / "fuse", smooth=True, **how)
-    for method in swept_volumes.PRINTED:
-        replay.run("predict", fused, out=scratch / method, overrides=(f"prediction.method={method}",))
     run_config = resolve("plan", fused, overrides=("plan.method=ssm", "plan.baselines=[]"))  # in Python
     moved = replay.execute(run_config, scratch / "ssm")
+    for method in swept_volumes.PRINTED:
+        replay.run("predict", fused, out=scratch / method, overrides=(f"prediction.method={method}",))
     states = next(read_states(fused / "state.parquet", 50))
     for method in swept_volumes.METHODS:
         assembly.prediction_stage(run_config).by(method).reachable(states)

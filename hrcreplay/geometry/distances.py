@@ -330,17 +330,32 @@ def nearest_pair(first_m: Floats, first_radius_m: Floats, second_m: Floats, seco
     return found
 
 
+#: Share of the sum of the coordinates by which balls around axes are enlarged, more than all rounding errors.
+_BALL_SHARE = 1e-7
+
+
 @njit(cache=True)
 def _nearest_rows(
     first: Floats, first_radius: Floats, second: Floats, second_radius: Floats, found: NearestPair
 ) -> None:
+    """Measures the pairs whose balls around the axes do not prove that another pair is nearer."""
+    ones, others = np.empty((first.shape[1], 4)), np.empty((second.shape[1], 4))
+    apart = np.empty((len(ones), len(others)))
     for i in range(len(first)):
+        _write_balls(first[i], ones)
+        _write_balls(second[i], others)
         least = np.inf
-        for a in range(first.shape[1]):
-            if not _is_finite(first[i, a]):
-                continue
-            for b in range(second.shape[1]):
-                if not _is_finite(second[i, b]):
+        for a in range(len(ones)):
+            for b in range(len(others)):
+                x, y, z = ones[a, 0] - others[b, 0], ones[a, 1] - others[b, 1], ones[a, 2] - others[b, 2]
+                gap = math.sqrt(x * x + y * y + z * z) - (first_radius[a] + second_radius[b])
+                apart[a, b] = gap - ones[a, 3] - others[b, 3]  # at least so far, and at most as their middles
+                if gap < least:
+                    least = gap
+        most, least = least, np.inf
+        for a in range(len(ones)):
+            for b in range(len(others)):
+                if not apart[a, b] <= min(most, least):
                     continue
                 gap, share, other = segment_distance(first[i, a], second[i, b])
                 gap -= first_radius[a] + second_radius[b]
@@ -353,11 +368,15 @@ def _nearest_rows(
 
 
 @njit(cache=True, inner=True)
-def _is_finite(ends: Floats) -> bool:
-    total = 0.0
-    for k in range(3):
-        total += abs(ends[0, k]) + abs(ends[1, k])
-    return math.isfinite(total)
+def _write_balls(axes: Floats, balls: Floats) -> None:
+    """Writes middle and radius (a, 4) of balls around axes (a, 2, 3); the radius of an axis that is not finite is NaN."""
+    for a in range(len(axes)):
+        total, half2 = 0.0, 0.0
+        for k in range(3):
+            total += abs(axes[a, 0, k]) + abs(axes[a, 1, k])
+            half2 += (0.5 * (axes[a, 1, k] - axes[a, 0, k])) ** 2
+            balls[a, k] = 0.5 * (axes[a, 0, k] + axes[a, 1, k])
+        balls[a, 3] = math.sqrt(half2) + _BALL_SHARE * (1.0 + total) if math.isfinite(total) else np.nan
 
 
 @njit(cache=True, inner=True)

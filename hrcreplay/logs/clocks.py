@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Hashable, Iterator
 from datetime import UTC, datetime
+from statistics import median
 
 import numpy as np
 
@@ -51,7 +52,7 @@ class CameraClock:
     @property
     def usual_ns(self) -> int:
         """The usual delay of the latest frames with an accepted stamp; 0 while they are few [ns]."""
-        return int(np.median(self._believed)) if len(self._believed) >= _LEAST else 0
+        return int(median(self._believed)) if len(self._believed) >= _LEAST else 0
 
     def capture_ns(self, stamp_ns: int, arrival_ns: int) -> int:
         """Returns the capture time of a row."""
@@ -110,7 +111,7 @@ class CameraClock:
         delays = [delay for _, delay in self._recent]
         if len(delays) < _SETTLED or max(delays) - min(delays) > _JUMP_NS:
             return
-        now_ns = int(np.median(delays))
+        now_ns = int(median(delays))
         if self._level_ns is not None and abs(now_ns - self._level_ns) > _JUMP_NS:
             self.jump_count += 1
             if len(self.jumps) < 3:

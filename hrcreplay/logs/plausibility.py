@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping
+from statistics import median
 
 import numpy as np
 
@@ -389,8 +390,8 @@ class Alternation:
 def _apart(points_m: Floats, others_m: Floats) -> float:
     """Returns the median distance of the points that both bodies have; NaN if there are none [m]."""
     away = np.linalg.norm(points_m - others_m, axis=1)
-    known = away[np.isfinite(away)]
-    return float(np.median(known)) if len(known) else float("nan")
+    known = away[np.isfinite(away)].tolist()
+    return median(known) if known else float("nan")  # of few numbers; numpy's takes ten times as long
 
 
 class BodyPosture:
