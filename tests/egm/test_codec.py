@@ -284,10 +284,12 @@ def test_packets_leave_no_memory_behind() -> None:
             decode_correction(encode_correction(Correction(seqno, 2, PACKET.q, PACKET.q)))
             decode_robot(encode_robot(PACKET))
 
-    speak()
-    before_kb = resident_kb()
-    speak()
-    assert resident_kb() - before_kb < 1000
+    grown_kb = []
+    for _ in range(4):
+        before_kb = resident_kb()
+        speak()
+        grown_kb.append(resident_kb() - before_kb)
+    assert min(grown_kb) < 1000  # a leak grows every time, what else this process does only now and then
 
 
 @pytest.mark.benchmark(group="egm")
