@@ -24,10 +24,10 @@ from hrcreplay.geometry.small_matrices import multiply
 from hrcreplay.human.fusion.fuse import MEDIAN_LENGTHS_M
 from hrcreplay.human.model import skeleton
 from hrcreplay.human.prediction import swept_volumes
-from hrcreplay.logs.reader import open_log
+from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.pipeline import assembly, stages
 from hrcreplay.pipeline.progress import NO_PROGRESS
-from hrcreplay.pipeline.run_config import resolve
+from hrcreplay.pipeline.run_config import RunConfig, resolve
 from hrcreplay.records import BODY, DOF, POINTS, Floats, HumanStates, Ints, SkeletonTrack
 from hrcreplay.robot.control.minimiser import compile_second_tries
 from hrcreplay.robot.control.separation import no_obstacles
@@ -57,14 +57,15 @@ def _compile_person(scratch: Path) -> None:
 
     how: Any = {"cell_file": replay.demo_cell(), **_SPAN}
     fused = replay.run("fuse", replay.demo_log(), out=scratch / "fuse", smooth=True, **how)
-    run_config = resolve("plan", fused, overrides=("plan.method=ssm", "plan.baselines=[]"))  # in Python
+    run_config = resolve("plan", fused, overrides=("plan.method=ssm", "plan.baselines=[]"))
+    log = open_log(run_config.log, run_config.settings.logs)
+    _move_with_nobody(run_config, log)
     moved = replay.execute(run_config, scratch / "ssm")
     for method in swept_volumes.PRINTED:
         replay.run("predict", fused, out=scratch / method, overrides=(f"prediction.method={method}",))
     states = next(read_states(fused / "state.parquet", 50))
     for method in swept_volumes.METHODS:
         assembly.prediction_stage(run_config).by(method).reachable(states)
-    log = open_log(run_config.log, run_config.settings.logs)
     _compile_rest(states)
     compile_second_tries()
     with RunWriter(scratch / "contact") as writer:
@@ -99,17 +100,22 @@ def _compile_robot(scratch: Path) -> None:
     how: Any = {"cell_file": replay.demo_cell(), "overrides": overrides, **_SPAN}
     run_config = resolve("plan", replay.demo_log(), **how)
     log = open_log(run_config.log, run_config.settings.logs)
-    ticks_ns = stages.span_ticks(run_config, log)
-    T_world_base = assembly.robot_base(run_config, log)
-    programme = assembly.programme(run_config, log, assembly.robot(run_config, T_world_base))
-    for planner in assembly.planners(run_config, programme, int(ticks_ns[0])).values():
-        planner.controller.step(lambda _horizon_s: no_obstacles())
+    ticks_ns, T_world_base = stages.span_ticks(run_config, log), assembly.robot_base(run_config, log)
+    _move_with_nobody(run_config, log)
     with RunWriter(scratch / "robot") as writer:
         writer.table("state", state_columns(_approaching(ticks_ns, T_world_base[:3, 3], log.header.cameras)))
         writer.close_tables()
         sink = stages.Sink(writer, Stopwatch(time.perf_counter_ns), NO_PROGRESS.advance)
         how = {"folder": writer.partial, "smooth": False}
         replay.run_stages(run_config, log, ticks_ns, len(ticks_ns), sink, ("fuse",), **how)
+
+
+def _move_with_nobody(run_config: RunConfig, log: Log) -> None:
+    """Moves each method of a run for one tick with nobody there."""
+    robot = assembly.robot(run_config, assembly.robot_base(run_config, log))
+    programme = assembly.programme(run_config, log, robot)
+    for planner in assembly.planners(run_config, programme, int(stages.span_ticks(run_config, log)[0])).values():
+        planner.controller.step(lambda _horizon_s: no_obstacles())
 
 
 def _approaching(ticks_ns: Ints, base_m: Floats, cameras: tuple[str, ...]) -> HumanStates:

@@ -369,7 +369,7 @@ def _nearest_rows(
 
 @njit(cache=True, inner=True)
 def _write_balls(axes: Floats, balls: Floats) -> None:
-    """Writes middle and radius (a, 4) of balls around axes (a, 2, 3); the radius of an axis that is not finite is NaN."""
+    """Writes middles and radii (a, 4) of balls around axes (a, 2, 3) [m]; NaN for an axis that is not finite."""
     for a in range(len(axes)):
         total, half2 = 0.0, 0.0
         for k in range(3):
