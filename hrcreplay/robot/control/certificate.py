@@ -627,8 +627,9 @@ def _gap(a: Floats, b: Floats, normal: Floats, vertices: Floats) -> float:
 
 def compile_second_tries(robot: RobotModel) -> None:
     """Compiles `clear` and what it calls where ``check`` leaves a pair unproven, so that no session compiles them."""
-    rest = at_rest(np.zeros(robot.nv))
-    clear(robot, rest, rest, no_obstacles(), 0.0, 1.0, NO_PLANES)
+    rest, nobody = at_rest(np.zeros(robot.nv)), no_obstacles()
+    clear(robot, rest, rest, nobody, 0.0, 1.0, NO_PLANES)
+    _kept(robot.arm, nobody.radius_m, 0.0)
     q, far = np.zeros((2, robot.nv)), np.full((1, 3), 100.0)
     course = Course(q, q, np.empty((0, 0, 2, 3)), travel_of(q, q, robot.axis_reach_m, 1.0))
     if len(robot.segments):

@@ -49,24 +49,11 @@ def obstacles(volumes: SweptVolumes, tick: int, horizon_s: float = math.inf) -> 
     """
     limbs = len(volumes.limbs)
     offsets = volumes.offsets[tick * limbs : (tick + 1) * limbs + 1]
-    vertices, offsets, radius, around, known = _hulls(volumes.vertices_m, offsets, volumes.radius_m[tick])
+    # copies, as a table's arrays are protected: kernels are compiled for arrays of ticks, which are not
+    vertices, radius = volumes.vertices_m[offsets[0] : offsets[-1]].copy(), volumes.radius_m[tick].copy()
+    offsets = offsets - offsets[0]
+    around, known = boxes(vertices, offsets, radius)
     return Obstacles(vertices, offsets, radius, around, known, horizon_s)
-
-
-@njit(cache=True)
-def _hulls(vertices: Floats, offsets: Ints, radius: Floats) -> tuple[Floats, Ints, Floats, Floats, bool]:
-    """Copies of one tick's hulls, with their ``boxes``: a table's numbers are protected, those of ticks are not.
-
-    Kernels are compiled for one of the two.
-
-    Args:
-        vertices: (m, 3) of several ticks [m].
-        offsets: (l + 1,) index of the first vertex of each hull of the tick.
-        radius: (l,) [m].
-    """
-    own, at, thick = vertices[offsets[0] : offsets[-1]].copy(), offsets - offsets[0], radius.copy()
-    around, known = boxes(own, at, thick)
-    return own, at, thick, around, known
 
 
 @cache
