@@ -17,8 +17,7 @@ from hrcreplay.robot.control.controllers import (
     QpController,
     ScalingController,
 )
-from hrcreplay.robot.control.qp_tick import TickStart
-from hrcreplay.robot.control.static_obstacles import StaticObstacles, no_shapes
+from hrcreplay.robot.control.static_obstacles import StaticObstacles
 from hrcreplay.robot.model import RobotModel
 
 #: The methods that the kernel knows.
@@ -73,14 +72,10 @@ class Planner:
 
     def _run(self, way: Way, people: PeopleAhead, columns: MotionColumns, tick: int) -> int:
         """Moves the robot in the kernel as far as it can from a tick on; returns the first tick that is not done."""
-        own, static = self.controller, self.controller.static
+        own = self.controller
         if not way.by_qp and np.isnan(own.stop.along[0, 0]):
             return tick  # it continues the stop of another method
-        shapes = no_shapes(len(self.robot.segments), self.robot.nv) if static is None else static.shapes
-        start = TickStart(own.stop, own.u, own.s_s, own.point.T_world_tcp, own.planes)
-        moving, rules = Moving(start, own.point), own.settings.tick_rules
-        arm, grid = self.robot.arm, own.reference.grid
-        done, moving = run_ticks(arm, grid, rules, shapes, way, people, moving, columns, tick)
+        done, moving = run_ticks(*own.scene, way, people, Moving(own.moment, own.point), columns, tick)
         (own.stop, own.u, own.s_s, _, own.planes), own.point = moving
         return done
 

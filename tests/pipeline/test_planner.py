@@ -12,7 +12,7 @@ import pytest
 from hrcreplay.geometry.polygon import ConvexPolygon
 from hrcreplay.human.fusion.vacancy import WatchedArea
 from hrcreplay.limits import load_limits
-from hrcreplay.pipeline.batch.ticks import MotionColumns
+from hrcreplay.pipeline.batch.ticks import LEFT, MotionColumns
 from hrcreplay.pipeline.planner import Planner
 from hrcreplay.pipeline.surroundings import Forecast, PredictionStage, Surroundings, WatchedBorder
 from hrcreplay.records import HumanStates, Motion, MotionRow
@@ -186,7 +186,7 @@ def test_what_the_kernel_cannot_predict_is_left_to_python(method: str) -> None:
     assert_same(found, expected)
     ahead = Forecast(around, people).ahead
     assert ahead is not None
-    assert 20 <= np.count_nonzero(ahead.what == 2) <= by_hand < TICKS // 2
+    assert 20 <= np.count_nonzero(ahead.what == LEFT) <= by_hand < TICKS // 2
 
 
 @pytest.mark.parametrize("prediction", ["paper", "positions"])

@@ -15,7 +15,6 @@ from scipy.optimize import linprog, nnls
 from hrcreplay.geometry.distances import distances, segment_distance
 from hrcreplay.records import Floats, Ints
 from hrcreplay.robot.control import qp_controller
-from hrcreplay.robot.control.certificate import MARGIN_M
 from hrcreplay.robot.control.control_step import PlanSettings, Proposal, Proposals, Stop
 from hrcreplay.robot.control.controllers import (
     Controller,
@@ -28,6 +27,7 @@ from hrcreplay.robot.control.controllers import (
 )
 from hrcreplay.robot.control.metric_rows import Problem
 from hrcreplay.robot.control.minimiser import Solution, minimise
+from hrcreplay.robot.control.motion_check import MARGIN_M
 from hrcreplay.robot.control.row_search import SLACK
 from hrcreplay.robot.control.separation import Approach, Obstacles, rows_of_people
 from hrcreplay.robot.control.static_obstacles import StaticObstacles, plane_rows

@@ -5,11 +5,11 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from hrcreplay.records import Floats, MotionRow
+from hrcreplay.records import MotionRow
 from hrcreplay.robot.control import path_controller, qp_controller
 from hrcreplay.robot.control.certificate import NO_PLANES, decide
 from hrcreplay.robot.control.contact_speed import SLOW, end_speeds, pair_speeds, select
@@ -36,7 +36,7 @@ from hrcreplay.robot.control.control_step import (
 from hrcreplay.robot.control.qp_controller import QpContext
 from hrcreplay.robot.control.qp_tick import QpTick, TickHulls, TickStart, decide_at_once
 from hrcreplay.robot.control.separation import Obstacles
-from hrcreplay.robot.control.static_obstacles import StaticObstacles, StaticShapes, no_shapes
+from hrcreplay.robot.control.static_obstacles import StaticObstacles, StaticShapes, shapes_of
 from hrcreplay.robot.kinematics import Arm
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.task import Grid, Reference, ReferencePoint, follow, place
@@ -58,16 +58,6 @@ class ControllerTick(NamedTuple):
 
 #: Horizon from the tick on [s] -> the swept volumes of the tick that are valid until then.
 Predict = Callable[[float], Obstacles]
-
-
-class Outlook(Protocol):
-    """The swept volumes of a batch of ticks."""
-
-    def predict(self, tick: int) -> Predict:
-        """Volumes of one tick."""
-
-    def until(self, horizon_s: Floats) -> list[Obstacles]:
-        """Volumes of every tick, each until its own horizon (n,) after it [s]."""
 
 
 class Observation(NamedTuple):
@@ -97,6 +87,16 @@ class Controller(ABC):
     def state(self) -> RobotState:
         """State of the robot."""
         return RobotState(self.stop.q[0], self.stop.dq[0])
+
+    @property
+    def moment(self) -> TickStart:
+        """Robot and reference as numbers for the kernel of a tick."""
+        return TickStart(self.stop, self.u, self.s_s, self.point.T_world_tcp, self.planes)
+
+    @property
+    def scene(self) -> tuple[Arm, Grid, TickRules, StaticShapes]:
+        """What no tick changes, as numbers for the kernel of a tick."""
+        return self.robot.arm, self.reference.grid, self.settings.tick_rules, shapes_of(self.robot, self.static)
 
     def take_over(self, stop: Stop) -> None:
         """Takes over the robot from another controller, together with its certified stop."""
@@ -193,12 +193,8 @@ class QpController(Controller):
         self, obstacles: Obstacles, horizon_s: float
     ) -> tuple[Arm, Grid, TickRules, StaticShapes, TickStart, TickHulls]:
         """The input of a tick as numbers for the kernel."""
-        robot, static, stop = self.robot, self.static, self.stop
-        shapes = no_shapes(len(robot.segments), robot.nv) if static is None else static.shapes
-        moment = TickStart(stop, self.u, self.s_s, self.point.T_world_tcp, self.planes)
         hulls = obstacles.vertices_m, obstacles.offsets, obstacles.radius_m, obstacles.boxes_m
-        people = TickHulls(*hulls, obstacles.known, horizon_s)
-        return robot.arm, self.reference.grid, self.settings.tick_rules, shapes, moment, people
+        return *self.scene, self.moment, TickHulls(*hulls, obstacles.known, horizon_s)
 
     def _move_on(self) -> None:
         """Does nothing: ``qp_context`` has already advanced the reference."""

@@ -11,7 +11,6 @@ import numpy as np
 
 from hrcreplay.kernels import njit
 from hrcreplay.records import Floats
-from hrcreplay.robot.control.certificate import CLEAR, REFUSED, UNDECIDED, judge
 from hrcreplay.robot.control.control_step import (
     LIMITED,
     NO_SOLUTION,
@@ -25,6 +24,7 @@ from hrcreplay.robot.control.control_step import (
     look,
     reason_to_stand,
 )
+from hrcreplay.robot.control.motion_check import CLEAR, REFUSED, UNDECIDED, judge
 from hrcreplay.robot.control.path_controller import RateBounds, propose_rows
 from hrcreplay.robot.control.qp_tick import TickHulls, TickStart
 from hrcreplay.robot.control.separation import NearestLink, Separation

@@ -21,7 +21,6 @@ from hrcreplay.geometry.vectors import dot_n, norm_n, turn_between
 from hrcreplay.kernels import njit
 from hrcreplay.records import Floats, Ints
 from hrcreplay.robot.control import control_step
-from hrcreplay.robot.control.certificate import RETREAT_SPEED
 from hrcreplay.robot.control.control_step import (
     PlanSettings,
     Proposal,
@@ -35,9 +34,10 @@ from hrcreplay.robot.control.control_step import (
 )
 from hrcreplay.robot.control.metric_rows import Limits, Problem
 from hrcreplay.robot.control.minimiser import Solution, minimise
+from hrcreplay.robot.control.motion_check import RETREAT_SPEED
 from hrcreplay.robot.control.row_search import SOLVED, search
 from hrcreplay.robot.control.separation import Obstacles, Separation, constraint_rhs, tick_rows
-from hrcreplay.robot.control.static_obstacles import StaticObstacles, StaticShapes, no_shapes, plane_rows
+from hrcreplay.robot.control.static_obstacles import StaticObstacles, StaticShapes, plane_rows, shapes_of
 from hrcreplay.robot.kinematics import Arm, RobotPose, axis_frames, tcp_jacobian
 from hrcreplay.robot.model import RobotModel
 
@@ -275,7 +275,7 @@ def _numbers(context: QpContext, settings: PlanSettings) -> tuple[Arm, QpRules, 
     hulls = obstacles.vertices_m, obstacles.offsets, obstacles.boxes_m
     ahead_s = horizon_s + plan.lead_s, static_ahead_s(horizon_s, plan.smooth_s)
     now = Instant(state.q, state.dq, u_before, target, sight.pose, pairs, *hulls, *ahead_s, speed_max)
-    shapes = no_shapes(len(robot.segments), robot.nv) if static is None else static.shapes
+    shapes = shapes_of(robot, static)
     return robot.arm, settings.rules, now, shapes
 
 

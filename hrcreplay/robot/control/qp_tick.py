@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 from hrcreplay.kernels import njit
 from hrcreplay.records import Floats, Ints
-from hrcreplay.robot.control.certificate import CLEAR, OPENING, RETREAT_SPEED, UNDECIDED, judge
 from hrcreplay.robot.control.control_step import (
     INSIDE,
     LIMITED,
@@ -25,6 +24,7 @@ from hrcreplay.robot.control.control_step import (
     look,
     reason_to_stand,
 )
+from hrcreplay.robot.control.motion_check import CLEAR, OPENING, RETREAT_SPEED, UNDECIDED, judge
 from hrcreplay.robot.control.qp_controller import Instant, Stops, Target, no_stops, propose_stops, static_ahead_s
 from hrcreplay.robot.control.separation import NearestLink
 from hrcreplay.robot.control.static_obstacles import StaticShapes

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
-from hrcreplay.records import Ints, Motion, MotionRow
+from hrcreplay.records import Floats, Ints, Motion, MotionRow
 from hrcreplay.robot.control.control_step import (
     REASONS,
     PlanSettings,
@@ -17,11 +18,17 @@ from hrcreplay.robot.control.control_step import (
     observe,
     stop_straight,
 )
-from hrcreplay.robot.control.controllers import Outlook
 from hrcreplay.robot.control.separation import Obstacles
 from hrcreplay.robot.control.static_obstacles import StaticObstacles
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.recorded import UNKNOWN, RecordedCapsules, RecordedJoints
+
+
+class Outlook(Protocol):
+    """The swept volumes of a batch of ticks."""
+
+    def until(self, horizon_s: Floats) -> list[Obstacles]:
+        """Volumes of every tick, each until its own horizon (n,) after it [s]."""
 
 
 @dataclass(frozen=True)

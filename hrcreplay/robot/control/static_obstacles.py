@@ -67,6 +67,11 @@ def no_shapes(links: int, axes: int) -> StaticShapes:
     return StaticShapes(*hulls, np.empty((0, 2), np.int64), np.empty(0), np.empty((axes, 0)))
 
 
+def shapes_of(robot: RobotModel, static: StaticObstacles | None) -> StaticShapes:
+    """What a robot keeps clear of beside people as numbers for kernels; None: nothing."""
+    return no_shapes(len(robot.segments), robot.nv) if static is None else static.shapes
+
+
 @dataclass(frozen=True)
 class StaticObstacles:
     """The objects of a cell and the pairs of links of one robot that are kept apart."""

@@ -10,8 +10,9 @@ from scipy.optimize import nnls
 
 from hrcreplay.records import Floats
 from hrcreplay.robot.control import certificate
-from hrcreplay.robot.control.certificate import CLEAR, NO_PLANES, REFUSED, check, clear, separating_normal
+from hrcreplay.robot.control.certificate import NO_PLANES, clear, separating_normal
 from hrcreplay.robot.control.control_step import RobotState, Stop, at_rest, observe, stop_axis_by_axis, stop_straight
+from hrcreplay.robot.control.motion_check import CLEAR, OPEN, REFUSED, check
 from hrcreplay.robot.control.separation import rows_of_people, worst_rows
 from hrcreplay.robot.model import RobotModel, irb140
 from tests.tools.random_stops import DT_S, TOOL_M, Box, as_obstacles, deepest_m, link_points, random_step, run
@@ -98,7 +99,7 @@ def unsearched(*given: Any) -> Any:
     done, course, planes, people, beside = check(*given)
     links, limbs = planes.shape[:2]
     every = np.array([(link, limb) for link in range(links) for limb in range(limbs)])
-    people = people._replace(pairs=every, results=np.full(len(every), certificate.OPEN))
+    people = people._replace(pairs=every, results=np.full(len(every), OPEN))
     return done, course, np.zeros_like(planes), people, beside
 
 

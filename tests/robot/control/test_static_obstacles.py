@@ -11,9 +11,10 @@ from scipy.spatial import Delaunay
 
 from hrcreplay.records import Floats
 from hrcreplay.robot.control.active_constraints import explain_refusal, find_holding_rows, name_planes
-from hrcreplay.robot.control.certificate import CLEAR, NO_PLANES, REFUSED, clear
+from hrcreplay.robot.control.certificate import NO_PLANES, clear
 from hrcreplay.robot.control.control_step import PlanSettings, Proposal, RobotState, at_rest, observe, stop_straight
 from hrcreplay.robot.control.minimiser import Solution, minimise
+from hrcreplay.robot.control.motion_check import CLEAR, REFUSED
 from hrcreplay.robot.control.qp_controller import QpContext, Target, problem, static_ahead_s
 from hrcreplay.robot.control.row_search import SLACK
 from hrcreplay.robot.control.separation import Obstacles
