@@ -3,6 +3,10 @@
 numba compares a cached kernel with its own source file, not with the files of the functions it calls: after an update,
 new kernels would contain old code. So each version of the sources has its own folder. numba also writes the index of a
 function's compiled versions without a lock; here each process locks the folder while it writes.
+
+numba also puts a copy of each called kernel into every caller, where it optimises and writes it again. Here that holds
+for small kernels only, which are worth inlining: a large one is compiled once, and its callers name it. So a caller
+that is read from the folder needs the large kernels it names, by names that do not depend on what else was compiled.
 """
 
 from __future__ import annotations
@@ -16,12 +20,13 @@ from contextlib import contextmanager
 from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 from llvmlite import binding
 from numba.core import event
-from numba.core.caching import FunctionCache
+from numba.core.caching import CompileResultCacheImpl, FunctionCache
+from numba.core.compiler import Compiler
 
 if "NUMBA_OPT" not in os.environ:  # compiles a fifth faster than level 3; only the fusion is then a fifth slower
     numba.config.OPT = type(numba.config.OPT)(1)
@@ -29,12 +34,70 @@ if "NUMBA_OPT" not in os.environ:  # compiles a fifth faster than level 3; only 
 #: The packages that contain kernels.
 ROOMS = ("audit", "calibration", "geometry", "human", "pipeline/batch", "robot")
 
+#: A kernel of more instructions is not copied into its callers. All kernels compile in about the same time for any
+#: value between 20 and 400.
+_LARGE = 150
+
+
+class _Apart(NamedTuple):
+    """A version of a large kernel, which is compiled once, apart from the kernels that call it."""
+
+    module: str
+    name: str
+    arguments: tuple[Any, ...]
+
+    def symbol(self) -> str:
+        """Name of the compiled function, which is loaded, or compiled if it is not in the folder."""
+        kernel = getattr(import_module(self.module), self.name)
+        kernel.compile(self.arguments)
+        return str(kernel.overloads[self.arguments].fndesc.llvm_func_name)
+
+
+#: The large kernels that this process has loaded or compiled, by the names of their compiled functions.
+_APART: dict[str, _Apart] = {}
+
+
+class _Compiler(Compiler):
+    """Names compiled functions alike in all processes; numba numbers them in the order of their compilation."""
+
+    def define_pipelines(self) -> Any:
+        self.state.func_id.unique_id = 0
+        return super().define_pipelines()
+
+
+class _Stored(CompileResultCacheImpl):
+    """What lies on disk of a compiled version: itself if it is large, the large kernels that it names, and its code."""
+
+    def reduce(self, cres: Any) -> tuple[_Apart | None, dict[str, _Apart], tuple[Any, ...]]:
+        """Returns what is to be written."""
+        named = sorted(one.name for one in cres.library._final_module.functions if one.is_declaration)  # noqa: SLF001
+        calls = {name: _APART[name] for name in named if name in _APART}
+        return _APART.get(cres.fndesc.llvm_func_name), calls, super().reduce(cres)
+
+    def rebuild(self, target_context: Any, payload: Any) -> Any:
+        """Loads a version and before it what it names; None, so that numba compiles it, if a name has changed."""
+        itself, calls, code = payload
+        if any(one.symbol() != name for name, one in calls.items()):
+            return None
+        if itself:
+            names = code[1].llvm_func_name, code[1].llvm_cpython_wrapper_name
+            # numba looks for the names in what it would copy into callers.
+            target_context.codegen()._engine._defined_symbols.update(names)  # noqa: SLF001
+            _APART[names[0]] = itself
+        return super().rebuild(target_context, code)
+
 
 class KernelCache(FunctionCache):
     """The compiled versions of one function on disk."""
 
+    _impl_class = _Stored
+
     def save_overload(self, sig: Any, data: Any) -> None:
         """Writes a compiled version; locked, as another process may add a version to the same index."""
+        symbol = data.fndesc.llvm_func_name
+        if _is_large(data.library._final_module):  # noqa: SLF001 (numba has no public way to choose what callers copy)
+            data.library._shared_module = _declaration(data.library._final_module, symbol)  # noqa: SLF001 (as above)
+            _APART[symbol] = _Apart(self._py_func.__module__, self._py_func.__name__, tuple(data.signature.args))
         with _locked():
             super().save_overload(sig, data)
 
@@ -42,6 +105,19 @@ class KernelCache(FunctionCache):
     def compiled(self) -> bool:
         """True once a version of the function is compiled from its present source file."""
         return bool(self._cache_file._load_index())  # noqa: SLF001 (as above)
+
+
+def _is_large(module: Any) -> bool:
+    """True if a module has more than ``_LARGE`` instructions, without the wrapper for calls from Python."""
+    bodies = (one for one in module.functions if not one.is_declaration and not one.name.startswith("_ZN7cpython"))
+    return sum(1 for body in bodies for block in body.blocks for _ in block.instructions) > _LARGE
+
+
+def _declaration(module: Any, symbol: str) -> Any:
+    """Returns a module that names a function of another one and does not contain it."""
+    returned, _, arguments = str(module.get_function(symbol).global_value_type).partition(" (")
+    layout = f'target datalayout = "{module.data_layout}"\ntarget triple = "{module.triple}"\n'
+    return binding.parse_assembly(f'{layout}declare {returned} @"{symbol}"({arguments}\n')
 
 
 #: The caches of all functions decorated so far.
@@ -62,7 +138,7 @@ def njit(*, inner: bool = False, **options: Any) -> Callable[[Any], Any]:
         others = numba.config.CACHE_DIR
         numba.config.CACHE_DIR = str(folder())  # numba reads it while it decorates the function
         try:
-            kernel = numba.njit(**options)(function)
+            kernel = numba.njit(pipeline_class=_Compiler, **options)(function)
             kernel.get_call_template = partial(_find_template, kernel.get_call_template)
             if options.get("cache"):
                 _CACHES.append(KernelCache(function))

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import ast
+import math
 import os
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+
+import pytest
 
 import hrcreplay
 from hrcreplay import kernels
@@ -102,3 +105,95 @@ def test_inner_kernels_are_called_by_kernels_alone() -> None:
         called |= _calls_from_python(path, module)
     assert len(inner) > 20
     assert not inner & called
+
+
+LARGE = """
+from math import sin
+from hrcreplay.kernels import njit
+@njit(cache=True{options})
+def large(x):
+    total = {start}
+{steps}
+    return total + {start}
+@njit(cache=True)
+def small(x):
+    return 2.0 * x
+"""
+CALLER = """
+from hrcreplay.kernels import njit
+from large import large, small
+@njit(cache=True)
+def both(x):
+    return large(x) + small(x)
+"""
+TELL = """
+import caller, large
+print(caller.both(1.5))
+print(*(sum(one.stats.cache_hits.values()) for one in (caller.both, large.large)))
+functions = list(list(caller.both.overloads.values())[0].library._final_module.functions)
+print(*(one.name for one in functions if "5largeB" in one.name or "5smallB" in one.name))
+print(*(one.is_declaration for one in functions if "5largeB" in one.name))
+"""
+
+
+def _write_large(folder: Path, start: float = 0.0, options: str = "") -> None:
+    steps = "\n".join(f"    total = sin(total + {number} * x)" for number in range(100))
+    (folder / "large.py").write_text(LARGE.format(start=start, steps=steps, options=options))
+
+
+def _tell_both(folder: Path) -> tuple[float, list[str], list[str]]:
+    """Calls ``both`` in a new process: result; how often it and ``large`` were read from disk; what its code names."""
+    there = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "kept")}
+    there["PYTHONPATH"] = os.pathsep.join([str(folder), str(Path(hrcreplay.__file__).parents[1])])
+    done = subprocess.run([sys.executable, "-c", TELL], env=there, capture_output=True, text=True, check=True)
+    result, hits, *code = done.stdout.splitlines()
+    return float(result), hits.split(), code
+
+
+def _result(start: float = 0.0) -> float:
+    total = start
+    for number in range(100):
+        total = math.sin(total + number * 1.5)
+    return total + start + 3.0
+
+
+@pytest.fixture
+def two_modules(tmp_path: Path) -> Path:
+    """A caller, a large kernel and a small one, and the folder of what is compiled."""
+    _write_large(tmp_path)
+    (tmp_path / "caller.py").write_text(CALLER)
+    (tmp_path / "kept").mkdir()
+    return tmp_path
+
+
+def test_a_large_kernel_is_no_part_of_its_callers(two_modules: Path) -> None:
+    result, hits, (functions, declared) = _tell_both(two_modules)
+    assert result == pytest.approx(_result(), abs=1e-15)
+    assert hits == ["0", "0"]
+    assert "5largeB" in functions  # named,
+    assert declared == "1"  # and compiled elsewhere
+    assert "5smallB" not in functions  # a copy of it was inlined
+    again, hits, _code = _tell_both(two_modules)
+    assert again == result
+    assert hits == ["1", "1"]
+
+
+def test_callers_find_a_large_kernel_that_was_lost_or_changed(two_modules: Path) -> None:
+    result, _hits, _code = _tell_both(two_modules)
+    for path in (two_modules / "kept").rglob("large.large-*"):
+        path.unlink()
+    assert _tell_both(two_modules)[:2] == (result, ["1", "0"])
+    _write_large(two_modules, start=0.25)
+    changed, hits, _code = _tell_both(two_modules)
+    assert changed == pytest.approx(_result(0.25), abs=1e-15)
+    assert abs(changed - result) > 0.01
+    assert hits == ["1", "0"]
+
+
+def test_a_caller_is_compiled_again_where_its_large_kernel_has_another_name(two_modules: Path) -> None:
+    """Loaded, it would name what is not there, and the process would crash."""
+    result, _hits, _code = _tell_both(two_modules)
+    _write_large(two_modules, options=", inner=True")
+    again, hits, _code = _tell_both(two_modules)
+    assert again == result
+    assert hits == ["0", "0"]

@@ -1,11 +1,12 @@
 """What each process of ``warmup`` runs so that the kernels of all commands are compiled.
 
 The robot does not wait for the fusion: it moves beside a person that is written down. So the two processes have about
-the same amount to compile. What both call is compiled by the one that comes to it first.
+the same amount to compile. What both call is compiled by the one that comes to it first, and found by the other.
 """
 
 from __future__ import annotations
 
+import gc
 import tempfile
 import time
 from collections.abc import Callable
@@ -28,7 +29,7 @@ from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.pipeline import assembly, stages
 from hrcreplay.pipeline.progress import NO_PROGRESS
 from hrcreplay.pipeline.run_config import RunConfig, resolve
-from hrcreplay.records import BODY, DOF, POINTS, Floats, HumanStates, Ints, SkeletonTrack
+from hrcreplay.records import BODY, DOF, POINTS, HumanStates, SkeletonTrack
 from hrcreplay.robot.control.minimiser import compile_second_tries
 from hrcreplay.robot.control.separation import no_obstacles
 from hrcreplay.settings.sections import Plan
@@ -38,28 +39,33 @@ from hrcreplay.store.run_folder import RunWriter, Stopwatch
 _SPAN: Any = {"start_s": 8.0, "end_s": 8.4}
 _METHODS: tuple[str, ...] = get_args(Plan.model_fields["method"].annotation)
 _SEARCH_S, _FRAMES = 0.01, 500  # of clock offsets
+_HORIZON_S = 0.1
+#: New objects before the collector of garbage looks: a compiler makes and keeps many, and a look takes long.
+_GARBAGE = 1_000_000
 #: Distance of the person from the robot's base at the first and the last tick [m].
 _FAR_M, _NEAR_M = 2.0, 0.3
 
 
 def compile_part(part: str) -> None:
     """Compiles one of ``kernel_build.PARTS`` in this process."""
+    gc.set_threshold(_GARBAGE)
     with tempfile.TemporaryDirectory() as scratch:
         _PARTS[part](Path(scratch))
 
 
 def _compile_person(scratch: Path) -> None:
-    """Fusion and smoothing, a robot on its path beside the recorded person, and the printed predictions.
+    """Predictions, fusion and smoothing, and a robot on its path beside the recorded person.
 
-    The other process needs what such a robot needs once it has compiled ``qp``, so it must not come last.
+    The sound prediction comes first: the other process needs it once its robot has moved with nobody there.
     """
     from hrcreplay.evaluation.contact import write_contact
 
     how: Any = {"cell_file": replay.demo_cell(), **_SPAN}
+    ahead = resolve("plan", replay.demo_log(), **how)
+    person = _approaching(ahead, open_log(ahead.log, ahead.settings.logs))
+    assembly.prediction_stage(ahead).predictor.prepare(person).volumes(_HORIZON_S, last=1)
     fused = replay.run("fuse", replay.demo_log(), out=scratch / "fuse", smooth=True, **how)
     run_config = resolve("plan", fused, overrides=("plan.method=ssm", "plan.baselines=[]"))
-    log = open_log(run_config.log, run_config.settings.logs)
-    _move_with_nobody(run_config, log)
     moved = replay.execute(run_config, scratch / "ssm")
     for method in swept_volumes.PRINTED:
         replay.run("predict", fused, out=scratch / method, overrides=(f"prediction.method={method}",))
@@ -67,7 +73,7 @@ def _compile_person(scratch: Path) -> None:
     for method in swept_volumes.METHODS:
         assembly.prediction_stage(run_config).by(method).reachable(states)
     _compile_rest(states)
-    compile_second_tries()
+    log = open_log(run_config.log, run_config.settings.logs)
     with RunWriter(scratch / "contact") as writer:
         for path in moved.glob("*.parquet"):
             writer.copy(path.name, moved)
@@ -100,32 +106,24 @@ def _compile_robot(scratch: Path) -> None:
     how: Any = {"cell_file": replay.demo_cell(), "overrides": overrides, **_SPAN}
     run_config = resolve("plan", replay.demo_log(), **how)
     log = open_log(run_config.log, run_config.settings.logs)
-    ticks_ns, T_world_base = stages.span_ticks(run_config, log), assembly.robot_base(run_config, log)
-    _move_with_nobody(run_config, log)
+    robot = assembly.robot(run_config, assembly.robot_base(run_config, log))
+    programme = assembly.programme(run_config, log, robot)
+    ticks_ns = stages.span_ticks(run_config, log)
+    for planner in assembly.planners(run_config, programme, int(ticks_ns[0])).values():
+        planner.controller.step(lambda _horizon_s: no_obstacles())
     with RunWriter(scratch / "robot") as writer:
-        writer.table("state", state_columns(_approaching(ticks_ns, T_world_base[:3, 3], log.header.cameras)))
+        writer.table("state", state_columns(_approaching(run_config, log)))
         writer.close_tables()
         sink = stages.Sink(writer, Stopwatch(time.perf_counter_ns), NO_PROGRESS.advance)
         how = {"folder": writer.partial, "smooth": False}
         replay.run_stages(run_config, log, ticks_ns, len(ticks_ns), sink, ("fuse",), **how)
+    compile_second_tries()
 
 
-def _move_with_nobody(run_config: RunConfig, log: Log) -> None:
-    """Moves each method of a run for one tick with nobody there."""
-    robot = assembly.robot(run_config, assembly.robot_base(run_config, log))
-    programme = assembly.programme(run_config, log, robot)
-    for planner in assembly.planners(run_config, programme, int(stages.span_ticks(run_config, log)[0])).values():
-        planner.controller.step(lambda _horizon_s: no_obstacles())
-
-
-def _approaching(ticks_ns: Ints, base_m: Floats, cameras: tuple[str, ...]) -> HumanStates:
-    """A person who comes up to the robot in x, known at all ticks.
-
-    Args:
-        ticks_ns: (n,) [ns].
-        base_m: (3,) base of the robot, world [m].
-        cameras: Names of the cameras.
-    """
+def _approaching(run_config: RunConfig, log: Log) -> HumanStates:
+    """A person who comes up to the robot in x, known at all ticks."""
+    ticks_ns, cameras = stages.span_ticks(run_config, log), log.header.cameras
+    base_m = assembly.robot_base(run_config, log)[:3, 3]
     n, none = len(ticks_ns), np.zeros((len(ticks_ns), DOF))
     p = np.tile([0.0, base_m[1], np.pi, 0.1, *(0.1, 0.5, 0.0, 1.8) * 2, 0.94], (n, 1))
     p[:, 0] = base_m[0] + np.linspace(_FAR_M, _NEAR_M, n)
