@@ -31,7 +31,7 @@ from hrcreplay.cli import (
     scale,
     span,
 )
-from hrcreplay.cli.commands import App, completion, interruptible, print_run, tell
+from hrcreplay.cli.commands import App, completion, give_back_memory, interruptible, print_run, tell
 from hrcreplay.errors import CoverageMissed, HrcReplayError, SettingRenamed, SettingsError
 from hrcreplay.version import __version__
 
@@ -196,6 +196,7 @@ def _stage(command: str, text: str) -> None:
 
 def _run(command: str, source: Path, **options: Any) -> Path:
     """Runs the stages up to that of a command, prints the main figures on standard error, returns the run folder."""
+    give_back_memory()
     from hrcreplay.commands import replay
     from hrcreplay.pipeline.progress import print_note
 
@@ -359,6 +360,7 @@ def compare(
     ] = 2,
 ) -> None:
     """Compare methods side by side on the same recording: what if another controller had been running?"""
+    give_back_memory()
     from hrcreplay.commands import compare as comparing
 
     folder = comparing.run(

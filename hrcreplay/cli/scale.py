@@ -13,6 +13,7 @@ from typing import Annotated
 import typer
 
 from hrcreplay.cli import CellFile, Chunk, Config, End, LimitSet, Set, Start, Topic, as_overrides, span
+from hrcreplay.cli.commands import give_back_memory
 from hrcreplay.errors import RunsFailed
 
 
@@ -105,6 +106,7 @@ def sweep(
     chunk_ticks: Chunk = 250,
 ) -> None:
     """Run every log with every setting of a grid on a Dask cluster; the same command again runs what is missing."""
+    give_back_memory()
     from hrcreplay.commands import sweep as sweeping
 
     found = sweeping.run(

@@ -99,9 +99,12 @@ def read_recorded_people(
 
 
 def _read_smoothed(path: Path) -> SmoothedPeople:
-    """Reads what is needed of smooth.parquet."""
+    """Reads what is needed of smooth.parquet, column by column, as a whole table of them would be there three times."""
     table = StoredTable(path)
-    p, lengths_m = (np.ascontiguousarray(table[list(names)].to_numpy(dtype=float)) for names in (JOINTS, LENGTHS))
+    p, lengths_m = np.empty((len(table), len(JOINTS))), np.empty((len(table), len(LENGTHS)))
+    for values, names in ((p, JOINTS), (lengths_m, LENGTHS)):
+        for k, name in enumerate(names):
+            values[:, k] = table[name]
     used = table[[name for name in table.columns if name.startswith("valid_")]].to_numpy(dtype=bool)
     person = table["person"].to_numpy() if "person" in table else None
     return SmoothedPeople(table["t_ns"].to_numpy(), p, lengths_m, np.asarray(used.any(axis=1)), person)

@@ -281,7 +281,7 @@ def read_people(
     best = smoothed_people() if rest else None
     for number in rest:
         own = best.of_person(number) if best is not None else None
-        mine = None if seen is None else seen.rows(seen.body == number)
+        mine = seen if seen is None or (seen.body == number).all() else seen.rows(seen.body == number)
         if own is not None and mine is not None and number > 1:  # bodies that were not yet a person
             known = np.isfinite(own.p[:, 0])
             since_ns = int(own.t_ns[known][0]) if known.any() else 2**62

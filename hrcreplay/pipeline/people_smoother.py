@@ -71,8 +71,7 @@ class StretchSmoother:
         """Smooths the next ``count`` ticks and removes them from memory."""
         states = HumanStates.join([part for part, _ in self._parts])
         trace = fuse.Trace.join([part for _, part in self._parts])
-        known = slice(0, count + self.LATER)
-        smoothed = smoother.smooth(states.rows(known), trace.rows(known), self._settings).rows(slice(0, count))
-        self._parts = [(states.rows(slice(count, None)), trace.rows(slice(count, None)))]
+        known, rest = slice(0, count + self.LATER), np.arange(count, len(states))
+        self._parts = [(states.rows(rest), trace.rows(rest))]  # copies: views would keep the whole stretch in memory
         self._count -= count
-        return smoothed
+        return smoother.smooth(states.rows(known), trace.rows(known), self._settings).rows(slice(0, count))
