@@ -158,8 +158,8 @@ def tell(note: str) -> None:
 def give_back_memory() -> None:
     """Lets this process and those that it starts return large arrays to the system as soon as they are freed.
 
-    glibc and Arrow keep such memory for later otherwise: a fifth of the most that a report of ten minutes has. An allocator that
-    the user chose in the environment stays.
+    glibc and Arrow keep such memory for later otherwise: a fifth of the most that a report of ten minutes has. An
+    allocator that the user chose in the environment stays.
     """
     os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
     if _MMAP not in os.environ and platform.libc_ver()[0] == "glibc":
