@@ -65,6 +65,10 @@ class _Compiler(Compiler):
         return super().define_pipelines()
 
 
+#: Number of parts of what ``_Stored`` writes; numba alone writes more.
+_PARTS = 3
+
+
 class _Stored(CompileResultCacheImpl):
     """What lies on disk of a compiled version: itself if it is large, the large kernels that it names, and its code."""
 
@@ -75,7 +79,12 @@ class _Stored(CompileResultCacheImpl):
         return _APART.get(cres.fndesc.llvm_func_name), calls, super().reduce(cres)
 
     def rebuild(self, target_context: Any, payload: Any) -> Any:
-        """Loads a version and before it what it names; None, so that numba compiles it, if a name has changed."""
+        """Loads a version and before it what it names; None, so that numba compiles it, if it no longer fits.
+
+        That is so if a name has changed, and for what numba alone or an older version has written.
+        """
+        if len(payload) != _PARTS:
+            return None
         itself, calls, code = payload
         if any(one.symbol() != name for name, one in calls.items()):
             return None
@@ -208,8 +217,8 @@ def progress() -> tuple[int, int]:
 
 @cache
 def _sources() -> str:
-    """Digest of the sources of the packages that contain kernels."""
-    digest, here = hashlib.sha256(), Path(__file__).parent
+    """Digest of the sources of the packages that contain kernels, and of this file, which says what is stored."""
+    digest, here = hashlib.sha256(Path(__file__).read_bytes()), Path(__file__).parent
     for source in sorted(path for room in ROOMS for path in (here / room).rglob("*.py")):
         digest.update(source.read_bytes())
     return digest.hexdigest()[:16]
