@@ -72,7 +72,7 @@ fuzz: $(VENV)/made
 
 # Everything from the lock, by hash and without a compiler; then the project itself, its kernels compiled in two processes.
 $(VENV)/made: requirements.lock pyproject.toml
-	@echo "Building $(VENV): some seven minutes, once."
+	@echo "Building $(VENV): one to seven minutes, once."
 	@$(PYTHON) -m venv $(VENV)
 	@$(PIP) --require-hashes --only-binary :all: -r requirements.lock
 	@$(PIP) --no-deps --no-build-isolation --editable .
