@@ -178,7 +178,8 @@ def test_a_large_kernel_is_no_part_of_its_callers(two_modules: Path) -> None:
     assert "5largeB" in functions  # named,
     assert declared == "1"  # and compiled elsewhere
     assert "5smallB" not in functions  # a copy of it was inlined
-    again, hits, _code = _tell_both(two_modules)
+    from_python = f"import large; assert abs(large.large(1.5) + 3.0 - {result!r}) < 1e-12\n"
+    again, hits, _code = _tell_both(two_modules, from_python)
     assert again == result
     assert hits == ["1", "1"]
 
@@ -188,6 +189,10 @@ def test_callers_find_a_large_kernel_that_was_lost_or_changed(two_modules: Path)
     for path in (two_modules / "kept").rglob("large.large-*"):
         path.unlink()
     assert _tell_both(two_modules)[:2] == (result, ["1", "0"])
+    for path in (two_modules / "kept").rglob("caller.both-*"):
+        path.unlink()
+    assert _tell_both(two_modules)[:2] == (result, ["0", "1"])
+    assert _tell_both(two_modules)[:2] == (result, ["1", "1"])  # it was compiled beside a large one read from disk
     _write_large(two_modules, start=0.25)
     changed, hits, _code = _tell_both(two_modules)
     assert changed == pytest.approx(_result(0.25), abs=1e-15)
