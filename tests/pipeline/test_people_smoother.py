@@ -1,0 +1,80 @@
+"""A long run is smoothed stretch by stretch: nothing is lost at their borders, for any batches."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+from hrcreplay.human.fusion import fuse
+from hrcreplay.human.fusion.fuse import Trace
+from hrcreplay.human.fusion.inverse_kinematics import measure
+from hrcreplay.human.fusion.smoother import smooth
+from hrcreplay.human.model import skeleton
+from hrcreplay.limits import load_limits
+from hrcreplay.pipeline.people_smoother import StretchSmoother
+from hrcreplay.records import HumanStates
+from hrcreplay.settings.sections import Fusion
+from tests.human.sightings import CAMERAS, LENGTHS_M, NEUTRAL, frames_of
+
+TICKS, LATER, N = 40, 15, 130
+SETTINGS = Fusion()
+
+
+@pytest.fixture(scope="module")
+def run() -> tuple[HumanStates, Trace]:
+    """Somebody who moves an arm, seen 50 times a second for a little more than three stretches."""
+    t_ns = 4_000_000 * np.arange(N)
+    captured_ns = t_ns[::5]
+    p = np.tile(NEUTRAL, (len(captured_ns), 1))
+    p[:, 9] += 0.5 * np.sin(10.0 * captured_ns * 1e-9)
+    points_m = skeleton(p, np.tile(LENGTHS_M, (len(p), 1))) + np.random.default_rng(1).normal(0, 0.01, (len(p), 20, 3))
+    measured = measure(frames_of(points_m, captured_ns * 0, captured_ns), np.tile(np.eye(4), (2, 1, 1)), SETTINGS)
+    _, states, _, trace = fuse.fuse(fuse.start(CAMERAS), t_ns, measured, SETTINGS, load_limits("human"), traced=True)
+    return states, trace
+
+
+def smoothed(run: tuple[HumanStates, Trace], size: int, monkeypatch: pytest.MonkeyPatch) -> list[HumanStates]:
+    monkeypatch.setattr(StretchSmoother, "TICKS", TICKS)
+    monkeypatch.setattr(StretchSmoother, "LATER", LATER)
+    one, (states, trace) = StretchSmoother(SETTINGS), run
+    parts = []
+    for first in range(0, N, size):
+        rows = slice(first, first + size)
+        parts += one.add(states.rows(rows), trace.rows(rows))
+    return parts + one.finish()
+
+
+@pytest.mark.parametrize("size", [1, 7, 40, 130])
+def test_each_stretch_is_smoothed_with_some_ticks_of_the_next(
+    run: tuple[HumanStates, Trace], size: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parts = smoothed(run, size, monkeypatch)
+    assert [len(part) for part in parts] == [40, 40, 40, 10]
+    states, trace = run
+    for k, part in enumerate(parts):
+        known = slice(k * TICKS, (k + 1) * TICKS + LATER)
+        alone = smooth(states.rows(known), trace.rows(known), SETTINGS).rows(slice(0, len(part)))
+        for field in fields(alone):
+            of_one, of_all = getattr(alone, field.name), getattr(part, field.name)
+            if isinstance(of_one, np.ndarray):
+                np.testing.assert_array_equal(of_one, of_all, err_msg=field.name)
+    changed = np.abs(np.concatenate([part.p for part in parts]) - states.p)
+    assert np.nanmax(changed) > 1e-3  # it does smooth
+
+
+def test_what_waits_for_the_next_stretch_does_not_keep_the_whole_one(
+    run: tuple[HumanStates, Trace], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(StretchSmoother, "TICKS", TICKS)
+    monkeypatch.setattr(StretchSmoother, "LATER", LATER)
+    one, (states, trace) = StretchSmoother(SETTINGS), run
+    one.add(states.rows(slice(0, TICKS + LATER)), trace.rows(slice(0, TICKS + LATER)))
+    [(kept, kept_trace)] = one._parts
+    for array in (kept.p, kept.points_m, kept_trace.cov):
+        assert len(array) == LATER
+        root = array
+        while isinstance(root.base, np.ndarray):
+            root = root.base
+        assert root.nbytes == array.nbytes
