@@ -136,8 +136,7 @@ class ControlSetup:
         return brake(state.q.copy(), state.dq.copy(), self.robot.ddq_max, self.plan.dt_s)
 
 
-@dataclass(frozen=True, eq=False)
-class MotionState:
+class MotionState(NamedTuple):
     """State of the commanded motion after an answer."""
 
     state: RobotState
@@ -161,7 +160,7 @@ def start_approach(setup: ControlSetup, motion: MotionState) -> MotionState:
     goal = setup.programme.sample(motion.programme_s).q
     controller = setup.follow(approach(setup.robot, motion.state.q, goal, setup.approach_speed), 0.0)
     controller.take_over(motion.stop)
-    return replace(motion, controller=controller, arrived=False)
+    return motion._replace(controller=controller, arrived=False)
 
 
 def follow(setup: ControlSetup, motion: MotionState, predict: Predict) -> MotionStep:
@@ -174,13 +173,13 @@ def follow(setup: ControlSetup, motion: MotionState, predict: Predict) -> Motion
         raise ValueError("follow: the robot has not set out")
     controller = copy(motion.controller)
     tick = controller.step(predict)
-    after = replace(motion, state=tick.step.next, stop=tick.step.stop, controller=controller)
+    after = motion._replace(state=tick.step.next, stop=tick.step.stop, controller=controller)
     if motion.arrived:
-        after = replace(after, programme_s=tick.programme_s)
+        after = after._replace(programme_s=tick.programme_s)
     elif _at_the_end(setup, controller):
         controller = setup.follow(setup.programme, motion.programme_s)
         controller.take_over(tick.step.stop)
-        after = replace(after, controller=controller, arrived=True)
+        after = after._replace(controller=controller, arrived=True)
     return MotionStep(tick.point.T_world_tcp[:3, 3], tick.point.tcp_speed, tick.step, after)
 
 

@@ -265,6 +265,34 @@ def test_looks_are_the_replay_tick_by_tick() -> None:
         assert_array_equal(last.volumes.vertices(0, limb), volumes.vertices(len(ticks) - 1, limb))
 
 
+def test_what_the_watchdog_looks_up_of_fresh_people_is_what_it_would_compute() -> None:
+    flight = Flight().fly(3.0)
+    controller, rng = flight.controller, np.random.default_rng(20)
+    look, setup = controller.perception, controller.setup
+    assert look is not None
+    told = set()
+    for _ in range(2000):
+        age_s = rng.choice([0.0, 0.05, setup.fresh_s, np.inf, np.nan], 2)
+        away_s = rng.choice([0.0, 0.1, np.inf], 2) if rng.integers(2) else None
+        states = look.states.rows(np.array([0, 0]))
+        states = replace(
+            states,
+            frame_age_s=age_s,
+            nobody_s=away_s,
+            unseen_s=np.where(rng.random((2, 1)) < 0.2, np.inf, states.unseen_s),
+            p_std=states.p_std * rng.choice([1.0, 50.0], (2, 1)),
+            v=states.v * rng.choice([1.0, np.nan], (2, 1), p=[0.8, 0.2]),
+        )
+        seen = replace(look, states=states)
+        fresh = session_controller._FreshPeople.of(seen, setup)
+        t_ns = look.t_ns + int(rng.choice([-4, 0, 4, 40, 200])) * 1_000_000
+        said = session_controller.reason_of_person(seen, t_ns, setup.fresh_s, setup.bounds)
+        if fresh.is_so(t_ns, setup.fresh_s):
+            assert fresh.reason == said
+            told.add(said)
+    assert told == {"", session_controller.UNCERTAIN, session_controller.NOT_FINITE}
+
+
 def test_a_bug_in_the_stages_brakes_the_robot_and_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     flight = Flight().fly(3.0)
     assert moved(flight, after=-10)
