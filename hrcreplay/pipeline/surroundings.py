@@ -11,7 +11,7 @@ import numpy as np
 from hrcreplay.human.fusion.vacancy import WatchedArea
 from hrcreplay.human.model import LimitSet
 from hrcreplay.human.prediction import swept_volumes
-from hrcreplay.pipeline.batch.ticks import KNOWN, LEFT, TOO_OLD, PeopleAhead
+from hrcreplay.pipeline.batch.ticks import KNOWN, LEFT, TOO_OLD, PeopleAhead, hulls_of
 from hrcreplay.records import BORDER, Floats, HumanStates, SweptVolumes, volume_name
 from hrcreplay.robot.control.border import Border
 from hrcreplay.robot.control.controllers import Predict
@@ -120,16 +120,16 @@ class Surroundings:
         numbers = [1] * len(fresh) if states.person is None else states.person[rows].tolist()
         if self.watched is None or states.nobody_s is None or states.nobody_else_s is None:
             found = join_obstacles(people)
-            return self._numbered(found if all(fresh.tolist()) else replace(found, known=False), numbers)
+            return self.numbered(found if all(fresh.tolist()) else replace(found, known=False), numbers)
         since_s = float(np.where(fresh, states.nobody_else_s[rows], states.nobody_s[rows]).max())
         horizon_s = people[0].horizon_s
         depth_m = self.watched.depth_m(since_s, horizon_s)
         known = [one for one, there in zip(people, fresh.tolist(), strict=True) if there]
         person = join_obstacles(known) if known else len(self.prediction.limbs)
         there = [number for number, is_fresh in zip(numbers, fresh.tolist(), strict=True) if is_fresh]
-        return self._numbered(self.watched.border.obstacles(depth_m, horizon_s, person), there)
+        return self.numbered(self.watched.border.obstacles(depth_m, horizon_s, person), there)
 
-    def _numbered(self, found: Obstacles, numbers: Sequence[int]) -> Obstacles:
+    def numbered(self, found: Obstacles, numbers: Sequence[int]) -> Obstacles:
         """The volumes of people and what follows them, with their places in ``names_of`` if that is needed."""
         if all(number == 1 for number in numbers):
             return found
@@ -192,25 +192,34 @@ class Forecast:
 
     def obstacles(self, tick: int, horizon_s: float) -> Obstacles:
         """Obstacles of one tick up to ``horizon_s`` [s]."""
-        rows, (first, volumes) = self.rows(tick), self._volumes(tick, horizon_s)
-        people = [obstacles(volumes, row - first, horizon_s) for row in range(rows.start, rows.stop)]
-        return self.around.obstacles(self.states, rows, people)
-
-    def _volumes(self, tick: int, horizon_s: float) -> tuple[int, SweptVolumes]:
-        """Volumes of a tick, and their first row; those of as many ticks after it as had this horizon before it.
-
-        A robot that stands asks for one horizon: to compute its ticks together is faster, and other methods ask, too.
-        """
         if horizon_s == self.around.prediction.horizon_s:
-            return 0, self.full
+            return self._of_rows(tick, horizon_s, 0, self.full)
         rows, self._lasted = self.rows(tick), self._lasted + 1 if self._last == (tick - 1, horizon_s) else 0
         self._last = tick, horizon_s
         first, found = self._ahead.get(horizon_s, (0, None))
         if found is None or not first <= rows.start <= rows.stop <= first + len(found):
-            last = min(tick + min(self._lasted, self.most_ahead), len(self.t_ns) - 1)
-            first, found = rows.start, self.person.volumes(horizon_s, rows.start, self.rows(last).stop)
+            together = min(self._lasted, self.most_ahead, len(self.t_ns) - 1 - tick)
+            if not together and self.ahead is not None and self.ahead.what[tick] != LEFT:
+                return self._alone(self.ahead, tick, horizon_s)
+            first, found = rows.start, self.person.volumes(horizon_s, rows.start, self.rows(tick + together).stop)
             self._ahead[horizon_s] = first, found
-        return first, found
+        return self._of_rows(tick, horizon_s, first, found)
+
+    def _of_rows(self, tick: int, horizon_s: float, first: int, volumes: SweptVolumes) -> Obstacles:
+        """Obstacles of a tick from volumes that begin at row ``first``.
+
+        They are those of as many ticks after another one as had its horizon before it: a robot that stands asks for one
+        horizon, and to compute its ticks together is faster, and other methods ask, too.
+        """
+        rows = self.rows(tick)
+        people = [obstacles(volumes, row - first, horizon_s) for row in range(rows.start, rows.stop)]
+        return self.around.obstacles(self.states, rows, people)
+
+    def _alone(self, ahead: PeopleAhead, tick: int, horizon_s: float) -> Obstacles:
+        """Obstacles of a tick alone, in one kernel: in half the time, and the same numbers."""
+        hulls = hulls_of(ahead, tick, horizon_s)
+        found = Obstacles(hulls.vertices, hulls.offsets, hulls.radius, hulls.boxes, hulls.known, horizon_s)
+        return self.around.numbered(found, ahead.number[self.rows(tick)].tolist())
 
     def until(self, horizon_s: Floats) -> list[Obstacles]:
         """Obstacles of every tick, each until its own horizon (n,) after it [s]."""

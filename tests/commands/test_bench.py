@@ -27,9 +27,11 @@ def test_every_stage_and_reference_is_timed() -> None:
     assert rows["volumes of a decision"].mean_us < rows["decision of qp"].mean_us, "a part of it"
     assert {"filterpy: dense filter", "filterpy: smoother", "smoother", "qhull: hulls of their vertices"} < set(rows)
     assert rows["fuse"].ticks == 76  # 0.3 s at 250 Hz, both ends
+    assert rows["fuse"].batch_median_us == pytest.approx(rows["fuse"].mean_us), "all of it is one batch"
     for row in found.rows:
         assert 0.0 < row.median_us <= row.p99_us <= row.max_us
         assert row.real_time_factor == pytest.approx(4000.0 / row.mean_us)
+        assert row.batch_median_us > 0.0
     assert found.peak_mb > 50.0
     assert json.loads(json.dumps(found.to_dict()))["rows"][0]["name"] == found.rows[0].name
     console = Console(width=160, record=True, quiet=False)

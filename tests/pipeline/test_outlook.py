@@ -12,11 +12,13 @@ import pytest
 from hrcreplay.commands import replay
 from hrcreplay.human.model import skeleton
 from hrcreplay.logs.reader import open_log
-from hrcreplay.pipeline import assembly, stages
+from hrcreplay.pipeline import assembly, stages, surroundings
+from hrcreplay.pipeline.batch.ticks import PeopleAhead, hulls_of
 from hrcreplay.pipeline.run_config import RunConfig, resolve
 from hrcreplay.pipeline.surroundings import Forecast, Surroundings
 from hrcreplay.records import POINTS, HumanStates
-from hrcreplay.robot.control.separation import Obstacles
+from hrcreplay.robot.control.qp_tick import TickHulls
+from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.store.run_folder import Stopwatch
 from tests.pipeline.test_several_people import STAGE, crowd
 
@@ -58,6 +60,30 @@ def test_each_tick_has_its_own_horizon(method: str) -> None:
         horizon_s = np.random.default_rng(2).uniform(0.0, 0.4, len(forecast.t_ns))
         for tick, found in enumerate(forecast.until(horizon_s)):
             assert_same(found, Forecast(around, people).obstacles(tick, float(horizon_s[tick])))
+
+
+def test_a_tick_alone_is_computed_in_one_kernel_and_has_the_same_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, states = demo("none")
+    alone: list[int] = []
+    compute = hulls_of
+
+    def listening(people: PeopleAhead, tick: int, horizon_s: float) -> TickHulls:
+        alone.append(tick)
+        return compute(people, tick, horizon_s)
+
+    monkeypatch.setattr(surroundings, "hulls_of", listening)
+    for people in (states.rows(slice(200, 260)), crowd(1, 2), crowd(3, 1, 2)):
+        age_s = np.where(np.arange(len(people)) % 7 == 3, 9.0, people.frame_age_s)
+        around, people = Surroundings(STAGE, fresh_s=0.3), replace(people, frame_age_s=age_s)
+        forecast = Forecast(around, people)
+        horizon_s = np.random.default_rng(4).uniform(0.0, 0.4, len(forecast.t_ns))
+        alone.clear()
+        for tick, until_s in enumerate(horizon_s.tolist()):
+            rows = forecast.rows(tick)
+            volumes = around.prediction.volumes(people.rows(rows), until_s)
+            each = [obstacles(volumes, row, until_s) for row in range(len(volumes))]
+            assert_same(forecast.obstacles(tick, until_s), around.obstacles(people, rows, each))
+        assert alone == list(range(len(forecast.t_ns)))
 
 
 def test_a_body_that_counts_by_its_points_and_one_partly_seen_have_their_own_horizons() -> None:

@@ -117,7 +117,7 @@ def run_ticks(
     while tick < len(found.status) and people.what[tick] != LEFT:
         start = moving.start
         horizon_s = horizon_after(len(start.stop.q) - 1, rules.ahead)
-        hulls = _hulls(people, tick, horizon_s)
+        hulls = hulls_of(people, tick, horizon_s)
         if way.by_qp:
             seen = decide_at_once(arm, grid, rules, static, start, hulls)
             if not seen.decided:
@@ -140,9 +140,9 @@ def run_ticks(
     return tick, moving
 
 
-@njit(cache=True, inner=True)
-def _hulls(people: PeopleAhead, tick: int, horizon_s: float) -> TickHulls:
-    """The volumes of a tick, as far as they are known."""
+@njit(cache=True)
+def hulls_of(people: PeopleAhead, tick: int, horizon_s: float) -> TickHulls:
+    """The volumes of a tick that is not left to Python, as far as they are known; valid for ``horizon_s`` [s]."""
     first, last = people.first[tick], people.first[tick + 1]
     span_s = np.full(last - first, horizon_s + people.latency_s)
     vertices, offsets, radii = sweep_sound(people.rows, first, last, span_s, people.rules, people.work)
