@@ -129,7 +129,7 @@ def _heights(volumes: SweptVolumes, future: RecordedFuture) -> Floats:
     found = np.full((2, len(volumes)), np.nan)
     for i in range(len(volumes)):
         pelvis = volumes.vertices(i, THORAX)[:2, 2]
-        seen = future.limbs[BODY[THORAX]][future.first[i] : future.last[i], 0, 2]
+        seen = future.of_limb(BODY[THORAX], i)[:, 0, 2]
         seen = seen[np.isfinite(seen)]
         if len(seen):
             found[:, i] = max(0.0, seen.max() - pelvis.max()), max(0.0, pelvis.min() - seen.min())

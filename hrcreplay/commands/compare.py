@@ -27,8 +27,9 @@ from hrcreplay.evaluation.contact import (
     Predicted,
     compute_full_coverage,
     compute_own_coverage,
-    contact_table,
+    contact_rows,
     read_recorded_people,
+    write_rows,
 )
 from hrcreplay.evaluation.recorded_person import RecordedPeople
 from hrcreplay.evaluation.severity import severity_table
@@ -53,7 +54,8 @@ from hrcreplay.robot.task import Reference
 from hrcreplay.settings.load import Settings
 from hrcreplay.settings.sections import Plan, Prediction
 from hrcreplay.store.columns import motion_columns, read_states
-from hrcreplay.store.run_folder import FolderTables, RunWriter, Stopwatch, arrow_table
+from hrcreplay.store.run_folder import FolderTables, RunWriter, Stopwatch
+from hrcreplay.store.stored_table import StoredTable
 
 #: The default variants: the programme without reaction; four methods with the sound volumes up to the end of each
 #: tick's own stop; qp with sound volumes up to a fixed horizon; and the two methods of the paper with its volumes and
@@ -421,16 +423,15 @@ def plan(task: VariantTask, progress: Callable[[int], None] | None = None) -> tu
         if progress is not None:
             progress(count)
     writer.close_tables()
-    motion = pq.read_table(task.folder / f"motion_{slug}.parquet").to_pandas()
+    motion = StoredTable(task.folder / f"motion_{slug}.parquet")
     predicted = Predicted(surroundings.prediction, states)
     own = compute_own_coverage(run_config, task.people, predicted, motion)
     full = None if task.variant.method in UNGUARDED else task.full
     recorded = task.programme.recorded if task.variant.method == RECORDED else None
     capsules = recorded if isinstance(recorded, RecordedCapsules) else None
     method, people = task.variant.method, task.people
-    rows = contact_table(run_config, robot, method, motion, people, predicted, own, full, capsules)
-    writer.table(f"contact_{slug}", rows)
-    meetings = arrow_table(rows).to_pandas()
+    every = contact_rows(run_config, robot, method, motion, people, predicted, own, full, capsules)
+    meetings = write_rows(every, partial(writer.table, f"contact_{slug}"))
     writer.table(f"severity_{slug}", severity_table(run_config, robot, method, motion, meetings, people, capsules))
     writer.close_tables()
     return done, time.perf_counter() - began_s

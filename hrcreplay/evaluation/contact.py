@@ -17,6 +17,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 from hrcreplay.evaluation.containment import Coverage, Outcome
 from hrcreplay.evaluation.recorded_person import BodyTrack, RecordedPeople, SmoothedPeople, read_people
@@ -29,6 +32,7 @@ from hrcreplay.pipeline.fusion_stage import SeenBodies
 from hrcreplay.pipeline.people_smoother import PeopleSmoother
 from hrcreplay.pipeline.person_fuser import PersonFuser
 from hrcreplay.pipeline.run_config import RunConfig
+from hrcreplay.pipeline.second_process import read_apart, write_apart
 from hrcreplay.pipeline.surroundings import PredictionStage
 from hrcreplay.records import (
     ALLOWING_CONTACT,
@@ -54,10 +58,12 @@ from hrcreplay.store.columns import (
     read_states_at,
     state_columns,
 )
-from hrcreplay.store.run_folder import RunWriter, arrow_table
+from hrcreplay.store.run_folder import RunWriter, TableWriter, arrow_table
 from hrcreplay.store.stored_table import RunTable, StoredTable
 
 _BATCH = 4096
+#: Ticks whose rows are made and written together: a long run's motions would fill the memory.
+_STRETCH = 16 * _BATCH
 
 #: Part of the body -> limb whose volume must contain it.
 VOLUME_OF = (
@@ -144,27 +150,37 @@ def write_contact(
     paths = sorted(writer.partial.glob("motion*.parquet"))
     coverages, there = judged.coverages, {}
     if second is not None:
-        second.submit(_take_there, judged)
+        write_apart(judged.path, judged)
+        second.submit(_take_there, judged.path)
         coverages = second.submit(_coverages_there).result
         every_other = [path for path in paths[1:] if path.stem != f"motion_{RECORDED}"][::2]
-        there = {path: second.submit(_tables_there, path) for path in every_other}
-    found: dict[Path, tuple[Columns, Columns]] = {}
+        there = {path: second.submit(_judge_there, path) for path in every_other}
+    meetings: dict[Path, Columns] = {}
     here = [path for path in paths if path not in there]
     for path in sorted(here, key=lambda path: path.stem == "motion"):  # last, as it needs both coverages
         motion, capsules = StoredTable(path), None
         if path.stem == "motion":
             shown_ns = motion["t_ns"].to_numpy()[:: max(1, round(run_config.settings.fusion.rate_hz / _BODY_HZ))]
-            writer.table("body", body_table(people, shown_ns, run_config.settings.prediction.hand_m))
+            for first in range(0, len(shown_ns), _BATCH):
+                some_ns = shown_ns[first : first + _BATCH]
+                writer.table("body", body_table(people, some_ns, run_config.settings.prediction.hand_m))
         if path.stem == f"motion_{RECORDED}" and motion["q1"].isna().all():
             capsules, _ = assembly.recorded_capsules(log, T_world_base)
-        found[path] = judged.tables(path, capsules, coverages)
+        meetings[path] = judged.judge(path, capsules, coverages)
     for path in paths:
-        rows, meetings = found.pop(path) if path in found else there.pop(path).result()
-        writer.table("contact", rows)
-        writer.table("severity", meetings)
+        writer.table("severity", meetings[path] if path in meetings else there[path].result())
+        _move_rows(judged.rows_of(path), writer)
     writer.close_tables()
     if second is not None:
         second.submit(_forget_there)
+
+
+def _move_rows(path: Path, writer: RunWriter) -> None:
+    """Appends the rows of a motion to contact.parquet and removes their file."""
+    with pq.ParquetFile(path, pre_buffer=False) as file:
+        for batch in file.iter_batches(batch_size=_STRETCH):
+            writer.table("contact", dict(zip(batch.schema.names, batch.columns, strict=True)))
+    path.unlink()
 
 
 @dataclass(frozen=True)
@@ -195,13 +211,22 @@ class _JudgedRun:
         run = self.run_config, self.people, self.predicted
         return compute_own_coverage(*run, StoredTable(self.folder / "motion.parquet")), compute_full_coverage(*run)
 
-    def tables(
+    @property
+    def path(self) -> Path:
+        """File of the run for the second process, until that has read it."""
+        return self.folder / ".judged"
+
+    def rows_of(self, path: Path) -> Path:
+        """File of the rows of contact of a motion, until all motions are judged."""
+        return self.folder / f".contact_{path.stem}.parquet"
+
+    def judge(
         self,
         path: Path,
         capsules: RecordedCapsules | None = None,
         coverages: Callable[[], tuple[Coverages, Coverages]] | None = None,
-    ) -> tuple[Columns, Columns]:
-        """Computes the rows of contact and of severity of a motion.
+    ) -> Columns:
+        """Computes the rows of contact of a motion, which go to a file of their own, and those of severity.
 
         Args:
             path: Table of the motion; that of the chosen method is judged by the volumes, too.
@@ -213,25 +238,28 @@ class _JudgedRun:
         motion, own, full = StoredTable(path), None, None
         if path.stem == "motion":
             own, full = (coverages or self.coverages)()
-        rows = contact_table(run_config, self.robot, method, motion, people, self.predicted, own, full, capsules)
-        meetings = arrow_table({name: rows[name] for name in MET}).to_pandas()
-        return rows, severity_table(run_config, self.robot, method, motion, meetings, people, capsules)
+        every = contact_rows(run_config, self.robot, method, motion, people, self.predicted, own, full, capsules)
+        rows = TableWriter(self.rows_of(path))
+        meetings = write_rows(every, rows.write)
+        rows.close()
+        return severity_table(run_config, self.robot, method, motion, meetings, people, capsules)
 
 
 #: The run that is judged in the second process.
 _THERE: list[_JudgedRun] = []
 
 
-def _take_there(judged: _JudgedRun) -> None:
-    _THERE[:] = [judged]
+def _take_there(path: Path) -> None:
+    _THERE[:] = [read_apart(path)]
+    path.unlink()
 
 
 def _coverages_there() -> tuple[Coverages, Coverages]:
     return _THERE[0].coverages()
 
 
-def _tables_there(path: Path) -> tuple[Columns, Columns]:
-    return _THERE[0].tables(path)
+def _judge_there(path: Path) -> Columns:
+    return _THERE[0].judge(path)
 
 
 def _forget_there() -> None:
@@ -297,7 +325,16 @@ def _coverage(
     return [check.outcome() for check in checks.values()]
 
 
-def contact_table(
+def write_rows(every: Iterator[Columns], write: Callable[[Columns], None]) -> pd.DataFrame:
+    """Writes the rows of ``contact_rows`` one after the other; returns what ``severity_table`` needs of all of them."""
+    met = []
+    for rows in every:
+        write(rows)
+        met.append(arrow_table({name: rows[name] for name in MET}))
+    return pa.concat_tables(met).to_pandas()
+
+
+def contact_rows(
     run_config: RunConfig,
     robot: RobotModel,
     method: str,
@@ -307,8 +344,8 @@ def contact_table(
     own: Coverages | None,
     full: Coverages | None,
     capsules: RecordedCapsules | None = None,
-) -> Columns:
-    """Computes the rows of contact.parquet for one motion.
+) -> Iterator[Columns]:
+    """Computes the rows of contact.parquet for one motion, one stretch of ticks after the other.
 
     Args:
         run_config: The run.
@@ -317,6 +354,39 @@ def contact_table(
         motion: Rows of a motion table.
         people: Recorded people.
         predicted: Volumes of any tick.
+        own: Result of ``compute_own_coverage``; None if not computed.
+        full: Result of ``compute_full_coverage``; None if not computed.
+        capsules: The robot as recorded by its capsules, in place of the links of ``robot``; None: no such robot.
+    """
+    decisions = None if method in (*UNGUARDED, *ALLOWING_CONTACT) else Decisions.of(motion)
+    for first in range(0, len(motion), _STRETCH):
+        rows = slice(first, first + _STRETCH)
+        some, used = motion.iloc[rows], None if decisions is None else decisions.by_rows(rows)
+        yield _rows_of(run_config, robot, method, some, people, predicted, used, own, full, capsules)
+
+
+def _rows_of(
+    run_config: RunConfig,
+    robot: RobotModel,
+    method: str,
+    motion: pd.DataFrame,
+    people: RecordedPeople,
+    predicted: Predicted,
+    decisions: Decisions | None,
+    own: Coverages | None,
+    full: Coverages | None,
+    capsules: RecordedCapsules | None,
+) -> Columns:
+    """Computes the rows of contact.parquet for a stretch of a motion.
+
+    Args:
+        run_config: The run.
+        robot: Robot at its base pose in the world.
+        method: Method of the motion.
+        motion: Rows of a motion table.
+        people: Recorded people.
+        predicted: Volumes of any tick.
+        decisions: Those that led to these rows; None: the method uses no volumes.
         own: Result of ``compute_own_coverage``; None if not computed.
         full: Result of ``compute_full_coverage``; None if not computed.
         capsules: The robot as recorded by its capsules, in place of the links of ``robot``; None: no such robot.
@@ -334,8 +404,8 @@ def contact_table(
     person = _nearest_person(each, people)
     worst, of_other = choose_nearer(person, other)
     outside_m = np.full(len(t_ns), np.nan)
-    if method not in (*UNGUARDED, *ALLOWING_CONTACT):
-        outside_m = by_volume(motion, person, people, radii_m, prediction.hand_m, predicted)
+    if decisions is not None:
+        outside_m = by_volume(motion, decisions, person, people, radii_m, prediction.hand_m, predicted)
     nobody: Coverages = [None] * len(each)
     pairs = zip(own or nobody, full or nobody, strict=True)
     of_each = [(_measure_left(a, t_ns), _measure_left(b, t_ns)) for a, b in pairs]
@@ -551,8 +621,28 @@ class Predicted:
         return -1 if row < 0 else int(ticks_ns[row])
 
 
+@dataclass(frozen=True)
+class Decisions:
+    """The decisions that led to some rows of a motion."""
+
+    t_ns: Ints  #: (n,) tick of the decision [ns]; -1: none
+    horizon_s: Floats  #: (n,) horizon of the volumes used there [s]
+
+    @classmethod
+    def of(cls, motion: RunTable) -> Decisions:
+        """Finds those of all rows of a motion."""
+        decided = deciding_rows(motion)
+        t_ns, horizon_s = motion["t_ns"].to_numpy(), motion["horizon_s"].to_numpy(dtype=float)
+        return cls(np.where(decided >= 0, t_ns[decided], -1), horizon_s[decided])
+
+    def by_rows(self, rows: slice) -> Decisions:
+        """Those of some of the rows."""
+        return Decisions(self.t_ns[rows], self.horizon_s[rows])
+
+
 def by_volume(
     motion: RunTable,
+    decisions: Decisions,
     found: Nearest,
     people: RecordedPeople,
     radii_m: Floats,
@@ -566,6 +656,7 @@ def by_volume(
 
     Args:
         motion: Rows of a motion table.
+        decisions: The decisions that led to them.
         found: Nearest pair with the tracks of all people at the same ticks.
         people: Recorded people.
         radii_m: (14,) radii of PARTS [m].
@@ -573,14 +664,11 @@ def by_volume(
         predicted: Volumes of any tick.
     """
     outside_m, tracks, numbers = np.full(len(motion), np.nan), people.person, people.numbers
-    t_ns, horizon_s = motion["t_ns"].to_numpy(), motion["horizon_s"].to_numpy(dtype=float)
-    decided = deciding_rows(motion)
-    touching = np.flatnonzero(_is_turning(motion) & (found.distance_m <= 0.0) & (decided >= 0)).tolist()
-    used = {i: (int(decided[i]), int(numbers[found.track[i]])) for i in touching}
+    t_ns, decided_ns, horizon_s = motion["t_ns"].to_numpy(), decisions.t_ns.tolist(), decisions.horizon_s.tolist()
+    touching = np.flatnonzero(_is_turning(motion) & (found.distance_m <= 0.0) & (decisions.t_ns >= 0)).tolist()
+    used = {i: (decided_ns[i], horizon_s[i], int(numbers[found.track[i]])) for i in touching}
     each = sorted(set(used.values()))
-    volumes = dict(
-        zip(each, predicted.volumes([(int(t_ns[k]), float(horizon_s[k]), number) for k, number in each]), strict=True)
-    )
+    volumes = dict(zip(each, predicted.volumes(each), strict=True))
     for i, key in used.items():
         part = int(found.part[i])
         solid = volumes[key].get(VOLUME_OF[PARTS[part]])

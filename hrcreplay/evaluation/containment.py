@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hrcreplay.evaluation.recorded_person import LIMB_POINTS, RecordedPerson
 from hrcreplay.geometry.distances import farthest_at_most
@@ -29,7 +30,9 @@ _END = 0.75
 _COUNT = 1024
 #: Rounding of a distance [m].
 _ROUNDING_M = 1e-9
-_SHOULDERS = [POINTS.index(f"shoulder_{side}") for side in "lr"]
+_NECK, *_SHOULDERS = (POINTS.index(name) for name in ("neck", "shoulder_l", "shoulder_r"))
+#: Limb -> indices of its recorded points.
+_OF_LIMB = {limb: [POINTS.index(name) for name in names] for limb, names in LIMB_POINTS.items()}
 
 
 @dataclass(frozen=True)
@@ -71,7 +74,7 @@ class RecordedFuture:
     """The recorded future of some ticks."""
 
     states: HumanStates  #: (n,) the fused person at the ticks
-    limbs: dict[str, Floats]  #: limb -> (m, k, 3) recorded points, world [m]
+    recorded: RecordedLimbs  #: the recorded points
     first: Ints  #: (n,) row of the first recorded instant after the tick
     last: Ints  #: (n,) row past the last one within the horizon
     seen: dict[str, Bools]  #: limb -> (n, k) True: the point was seen in the last quarter of the horizon
@@ -79,7 +82,11 @@ class RecordedFuture:
     def rows(self, which: slice | Ints) -> RecordedFuture:
         """Selects some of the ticks."""
         seen = {limb: part[which] for limb, part in self.seen.items()}
-        return RecordedFuture(self.states.rows(which), self.limbs, self.first[which], self.last[which], seen)
+        return RecordedFuture(self.states.rows(which), self.recorded, self.first[which], self.last[which], seen)
+
+    def of_limb(self, limb: str, tick: int) -> Floats:
+        """(m, k, 3) recorded points of a limb within the horizon of a tick, world [m]."""
+        return self.recorded.points(limb, slice(self.first[tick], self.last[tick]))
 
     def checked(self, limb: str) -> Bools:
         """(n,) True if the limb can be checked: both its ends were seen near the horizon's end."""
@@ -97,11 +104,11 @@ class RecordedFuture:
 
 @dataclass(frozen=True)
 class RecordedLimbs:
-    """The recorded points of a person's limbs."""
+    """The recorded points of a person's limbs. Those of a limb are copied when they are asked for, not all at once."""
 
     t_ns: Ints  #: (m,) instants, increasing
-    points_m: dict[str, Floats]  #: limb -> (m, k, 3), world [m]; NaN if not recorded or rejected
-    counts: dict[str, Ints]  #: limb -> (m + 1, k) number of rows before each in which a point was recorded
+    points_m: Floats  #: (m, 20, 3) POINTS, world [m]; NaN if not recorded or rejected
+    counts: dict[str, NDArray[np.int32]]  #: limb -> (m + 1, k) number of rows before each that have a point
 
     @classmethod
     def of(cls, t_ns: Ints, points_m: Floats) -> RecordedLimbs:
@@ -111,15 +118,21 @@ class RecordedLimbs:
             t_ns: (m,) instants, increasing [ns].
             points_m: (m, 20, 3) POINTS of the person, world [m]; NaN if not recorded or rejected.
         """
-        points = points_m.copy()
-        # the model's neck is the middle of the shoulders, not the neck point of a camera
-        points[:, POINTS.index("neck")] = 0.5 * (points[:, _SHOULDERS[0]] + points[:, _SHOULDERS[1]])
-        limbs, counts = {}, {}
-        for limb, names in LIMB_POINTS.items():
-            limbs[limb] = np.ascontiguousarray(points[:, [POINTS.index(n) for n in names]])
-            counts[limb] = np.zeros((len(points) + 1, len(names)), np.int64)
-            np.cumsum(np.isfinite(limbs[limb]).all(axis=2), axis=0, out=counts[limb][1:])
-        return cls(t_ns, limbs, counts)
+        known: Bools = np.asarray(np.isfinite(points_m).all(axis=2))
+        known[:, _NECK] = np.isfinite(_neck(points_m)).all(axis=1)
+        counts = {}
+        for limb, of in _OF_LIMB.items():
+            counts[limb] = np.zeros((len(points_m) + 1, len(of)), np.int32)
+            np.cumsum(known[:, of], axis=0, out=counts[limb][1:])
+        return cls(t_ns, points_m, counts)
+
+    def points(self, limb: str, rows: slice) -> Floats:
+        """(m, k, 3) points of a limb in some rows; the neck is the model's, the middle of the shoulders."""
+        of, whole = _OF_LIMB[limb], self.points_m[rows]
+        found = np.take(whole, of, axis=1)
+        if _NECK in of:
+            found[:, of.index(_NECK)] = _neck(whole)
+        return found
 
     def future(self, states: HumanStates, horizon_s: float | Floats) -> RecordedFuture:
         """Returns the recorded future (t, t + T] of some ticks.
@@ -133,7 +146,12 @@ class RecordedLimbs:
         last = np.searchsorted(self.t_ns, states.t_ns + horizon_ns, side="right")
         end = np.searchsorted(self.t_ns, states.t_ns + np.round(_END * horizon_ns).astype(np.int64), side="right")
         seen = {limb: np.asarray(count[last] > count[end]) for limb, count in self.counts.items()}
-        return RecordedFuture(states, self.points_m, first, last, seen)
+        return RecordedFuture(states, self, first, last, seen)
+
+
+def _neck(points_m: Floats) -> Floats:
+    """(n, 3) the middle of the shoulders of bodies (n, 20, 3) [m]."""
+    return np.asarray(0.5 * (points_m[:, _SHOULDERS[0]] + points_m[:, _SHOULDERS[1]]))
 
 
 def recorded_future(t_ns: Ints, points_m: Floats, states: HumanStates, horizon_s: float | Floats) -> RecordedFuture:
@@ -216,7 +234,7 @@ def _at_most(vertices_m: Floats, future: RecordedFuture, tick: int, limb: str, e
 
 
 def _points(future: RecordedFuture, tick: int, limb: str) -> Floats:
-    return future.limbs[limb][future.first[tick] : future.last[tick]].reshape(-1, 3)
+    return future.of_limb(limb, tick).reshape(-1, 3)
 
 
 def select_rows(

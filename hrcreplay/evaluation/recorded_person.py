@@ -131,12 +131,32 @@ class ModelPoints:
 
 
 @dataclass(frozen=True)
+class CameraPoints:
+    """The points (n, 20, 3) of a person that one camera shows, among those of all cameras [m]; NaN where not known.
+
+    The neck is the middle of the shoulders, if they are known.
+    """
+
+    all_m: Floats  #: (m, 20, 3) of all cameras in order of time
+    mine: Ints  #: (n,) rows of this camera
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Number of rows, points and coordinates."""
+        return len(self.mine), *self.all_m.shape[1:]
+
+    def __getitem__(self, rows: slice | Ints) -> Floats:
+        """The points of some rows."""
+        return _with_middle_neck(self.all_m[self.mine[rows]])
+
+
+@dataclass(frozen=True)
 class BodyTrack:
     """Points of one body over time, from one source."""
 
     source: str  #: TRUTH, SMOOTHED, or a camera; for another body, the camera and the tracker's id
     t_ns: Ints  #: (n,) increasing
-    points_m: Floats | ModelPoints  #: (n, 20, 3) POINTS, world [m]; NaN if unknown
+    points_m: Floats | ModelPoints | CameraPoints  #: (n, 20, 3) POINTS, world [m]; NaN if unknown
     hold_s: float = 0.0  #: time around a sample for which a point counts if the neighbouring sample lacks it [s]
 
     @cached_property
@@ -204,7 +224,9 @@ class RecordedPeople:
         return np.array([one.number for one in self.people for _ in one.tracks], dtype=np.int64)
 
 
-def at_instants(t_ns: Ints, points_m: Floats | ModelPoints, at_ns: Ints, gap_s: float, hold_s: float = 0.0) -> Floats:
+def at_instants(
+    t_ns: Ints, points_m: Floats | ModelPoints | CameraPoints, at_ns: Ints, gap_s: float, hold_s: float = 0.0
+) -> Floats:
     """Interpolates body points at some instants: linear between two samples, or constant for a short time.
 
     Args:
@@ -338,16 +360,22 @@ def _recorded_person(
     smoothed = from_states(best, fusion_stage.filter.memory_s)
     if seen is None or not len(seen):
         return RecordedPerson(number, SMOOTHED, smoothed.t_ns, smoothed.points_m[:], (smoothed,))
-    parts = [seen.rows(slice(first, first + _BATCH)) for first in range(0, len(seen), _BATCH)]
-    points = np.concatenate([_select_accepted(part, best, fusion_stage)[0] for part in parts])
-    source, t_ns, points_m = _recorded_points(seen, points, best)
+    order = np.argsort(seen.capture_ns, kind="stable")
+    place, t_ns, points_m = np.argsort(order), seen.capture_ns[order], np.empty(seen.points_m.shape)
+    for first in range(0, len(seen), _BATCH):
+        rows = slice(first, first + _BATCH)
+        points_m[place[rows]] = _select_accepted(seen.rows(rows), best, fusion_stage)[0]
+    shown: Bools = np.asarray(np.isfinite(points_m).any(axis=(1, 2)))
+    if not shown.any():
+        return RecordedPerson(number, SMOOTHED, smoothed.t_ns, _smoothed_points(best), (smoothed,))
+    camera = seen.camera[order]
     cameras = [
-        _track(camera, seen.capture_ns[mine], points[mine])
-        for c, camera in enumerate(seen.cameras)
-        for mine in [seen.camera == c]
-        if np.isfinite(points[mine]).any()
+        BodyTrack(name, t_ns[mine], CameraPoints(points_m, mine), _HOLD_S)
+        for c, name in enumerate(seen.cameras)
+        for mine in [np.flatnonzero(camera == c)]
+        if shown[mine].any()
     ]
-    return RecordedPerson(number, source, t_ns, points_m, (smoothed, *cameras))
+    return RecordedPerson(number, CAMERAS, t_ns, points_m, (smoothed, *cameras))
 
 
 def _truth(log: Log, ticks_ns: Ints) -> BodyTrack | None:
@@ -365,11 +393,15 @@ def _truth(log: Log, ticks_ns: Ints) -> BodyTrack | None:
 def _track(source: str, t_ns: Ints, points_m: Floats) -> BodyTrack:
     """Makes a camera's track, in order of capture; the neck is the middle of the shoulders, if they are known."""
     order = np.argsort(t_ns, kind="stable")
-    t_ns, points_m = t_ns[order], points_m[order]
+    return BodyTrack(source, t_ns[order], _with_middle_neck(points_m[order]), _HOLD_S)
+
+
+def _with_middle_neck(points_m: Floats) -> Floats:
+    """Puts the neck of bodies (n, 20, 3) in the middle of the shoulders, if they are known; returns the same array."""
     neck, right, left = (POINTS.index(name) for name in ("neck", "shoulder_r", "shoulder_l"))
     middle = 0.5 * (points_m[:, right] + points_m[:, left])
     points_m[:, neck] = np.where(np.isnan(middle), points_m[:, neck], middle)
-    return BodyTrack(source, t_ns, points_m, _HOLD_S)
+    return points_m
 
 
 def _tracks_of(bodies: CameraFrames, fusion_stage: FusionStage) -> Iterator[BodyTrack]:
@@ -469,12 +501,15 @@ def read_recordings(
     return found
 
 
-def _recorded_points(
-    seen: Measurements | CameraFrames, points: Floats, best: SmoothedPeople
-) -> tuple[str, Ints, Floats]:
+def _smoothed_points(best: SmoothedPeople) -> Floats:
+    """(n, 20, 3) points of the smoothed person at every tick [m]."""
+    return skeleton(best.p, best.lengths_m)
+
+
+def _recorded_points(seen: Measurements, points: Floats, best: SmoothedPeople) -> tuple[str, Ints, Floats]:
     """Returns source, instants and points of the person: accepted camera points, else the smoothed person."""
     if not np.isfinite(points).any():
-        return SMOOTHED, best.t_ns, skeleton(best.p, best.lengths_m)
+        return SMOOTHED, best.t_ns, _smoothed_points(best)
     order = np.argsort(seen.capture_ns, kind="stable")
     return CAMERAS, seen.capture_ns[order], points[order]
 

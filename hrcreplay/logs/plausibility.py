@@ -407,8 +407,8 @@ class BodyPosture:
             points[:, POINTS.index(name)] for name in ("pelvis", "neck", "head", "shoulder_r", "shoulder_l")
         )
         top = np.where(np.isfinite(neck), neck, np.where(np.isfinite(head), head, 0.5 * (right + left)))
-        self._upright.append(_unit(top - pelvis)[:, 2])
-        self._pelvis.append(pelvis[:, 2])
+        self._upright.append(_unit(top - pelvis)[:, 2].copy())  # copies: a view would keep all points of the log
+        self._pelvis.append(pelvis[:, 2].copy())
 
     def remark(self, camera: str) -> str | None:
         """Returns a note on a body that is not upright on the floor; None for a plausible one."""

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import multiprocessing
+import pickle
 import signal
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
+from pathlib import Path
 from threading import Lock
 from typing import Any, TypeVar
 
@@ -30,6 +32,26 @@ def second_process() -> Iterator[ProcessPoolExecutor]:
                 process.terminate()
             pool.shutdown(cancel_futures=True)
             raise
+
+
+def write_apart(path: Path, value: object) -> None:
+    """Writes a value to a file for the other process. Sent in a message, large arrays would be in memory twice more."""
+    buffers: list[pickle.PickleBuffer] = []
+    content = pickle.dumps(value, protocol=5, buffer_callback=buffers.append)
+    with path.open("wb") as file:
+        pickle.dump((content, [buffer.raw().nbytes for buffer in buffers]), file)
+        for buffer in buffers:
+            file.write(buffer.raw())
+
+
+def read_apart(path: Path) -> Any:
+    """Reads what ``write_apart`` has written; arrays that were protected are so here."""
+    with path.open("rb") as file:
+        content, sizes = pickle.load(file)  # noqa: S301 - our own file
+        buffers = [bytearray(size) for size in sizes]
+        for buffer in buffers:
+            file.readinto(buffer)
+    return pickle.loads(content, buffers=buffers)  # noqa: S301
 
 
 def share(

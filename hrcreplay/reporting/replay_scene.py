@@ -355,7 +355,9 @@ def _pick(table: RunTable, names: list[str], at_ns: Ints) -> Floats:
     if not len(table) or not set(names) <= set(table.columns):
         return np.full((len(at_ns), len(names)), np.nan)
     row, known = _rows(table, at_ns)
-    found = table[names].to_numpy(dtype=float)[row]
+    found = np.empty((len(at_ns), len(names)))
+    for k, name in enumerate(names):  # column by column: all of a long run would be in memory three times
+        found[:, k] = table[name].to_numpy(dtype=float)[row]
     found[~known] = np.nan
     return found
 
@@ -473,15 +475,16 @@ def _stops(
         return np.where(np.isfinite(tau_s)[:, None], np.array(ends), np.nan)
     if method == RECORDED or "programme_s" not in motion:
         return straight
-    names = ["programme_s", *(f"q{i}" for i in range(1, robot.nv + 1))]
     tables = [motion, *(table for name, table in run.baselines.items() if name == "none")]
-    driven = np.concatenate([table[names].to_numpy(dtype=float) for table in tables])
-    s_s, first = np.unique(driven[:, 0], return_index=True)
-    path = driven[first, 1:]
+
+    def driven(name: str) -> Floats:
+        return np.concatenate([table[name].to_numpy(dtype=float) for table in tables])
+
+    s_s, first = np.unique(driven("programme_s"), return_index=True)
     rate = np.gradient(numeric_column(motion, "programme_s"), times(motion) * 1e-9)
     row, _ = _rows(motion, t_ns)
     at_s = numeric_column(motion, "programme_s")[row] + 0.5 * rate[row] * tau_s
-    return np.column_stack([np.interp(at_s, s_s, axis) for axis in path.T])
+    return np.column_stack([np.interp(at_s, s_s, driven(f"q{i}")[first]) for i in range(1, robot.nv + 1)])
 
 
 def _names(motion: RunTable, column: str, at_ns: Ints) -> tuple[tuple[str, ...], Ints]:

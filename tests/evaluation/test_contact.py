@@ -180,7 +180,7 @@ def test_a_contact_is_laid_at_the_door_of_robot_or_prediction(robot: RobotModel)
     alone = RecordedPeople((RecordedPerson(1, body.source, body.t_ns, body.points_m[:], (body,)),), ())
     for ball_m, sign in ((0.5, -1.0), (0.1, 1.0)):
         known = Known(at, ball_m)
-        outside = contact.by_volume(motion, found, alone, RADII_M, 0.0, known)  # type: ignore[arg-type]
+        outside = contact.by_volume(motion, contact.Decisions.of(motion), found, alone, RADII_M, 0.0, known)  # type: ignore[arg-type]
         np.testing.assert_array_equal(np.flatnonzero(np.isfinite(outside)), touching)
         np.testing.assert_allclose(outside[touching], 0.2 + 0.05 - ball_m, atol=3e-3)
         assert (np.sign(outside[touching]) == sign).all()
@@ -188,7 +188,7 @@ def test_a_contact_is_laid_at_the_door_of_robot_or_prediction(robot: RobotModel)
         assert known.asked[-1] == (decided * DT_NS, 0.04)
     no_legs = Known(at, 0.5)
     no_legs.solid = {"LEGS": no_legs.solid["LRA"]}
-    assert np.isnan(contact.by_volume(motion, found, alone, RADII_M, 0.0, no_legs)).all()  # type: ignore[arg-type]
+    assert np.isnan(contact.by_volume(motion, contact.Decisions.of(motion), found, alone, RADII_M, 0.0, no_legs)).all()  # type: ignore[arg-type]
 
 
 def test_parts_are_held_against_the_volume_of_their_limb() -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from hrcreplay.errors import LogError
 from hrcreplay.logs.info import lines, summarize
+from hrcreplay.logs.plausibility import BodyPosture
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.records import LIMBS, POINTS, CameraFrames, Floats
 from hrcreplay.settings.sections import Decoder, Logs
@@ -146,3 +147,11 @@ def test_limbs_that_no_camera_measured_are_told(tmp_path: Path) -> None:
 def _notes(log: Log) -> list[str]:
     own.read(log)
     return log.notes
+
+
+def test_a_posture_keeps_two_numbers_of_a_body_and_not_its_points() -> None:
+    posture = BodyPosture()
+    posture.add(np.random.default_rng(1).normal(size=(50, 20, 3)))
+    kept = [array for parts in vars(posture).values() for array in parts]
+    assert [array.shape for array in kept] == [(50,), (50,)]
+    assert all(array.base is None for array in kept), "a view would keep the points of a whole log in memory"

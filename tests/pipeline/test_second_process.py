@@ -8,11 +8,13 @@ from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from hrcreplay.commands import replay
+from hrcreplay.evaluation import contact
 from hrcreplay.pipeline.run_config import resolve
-from hrcreplay.pipeline.second_process import second_process, share
+from hrcreplay.pipeline.second_process import read_apart, second_process, share, write_apart
 
 
 def _fail() -> None:
@@ -48,8 +50,10 @@ def test_two_processes_write_the_same_bytes_as_one(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(replay, "run_stages", stages)
     how: Any = {"cell_file": replay.demo_cell(), "start_s": 8.0, "end_s": 9.0}
     found = []
+    stretch = contact._STRETCH
     for processes in (1, 2):
         assert not taken
+        monkeypatch.setattr(contact, "_STRETCH", 64 if processes == 1 else stretch)  # rows that are made together
         folder = replay.execute(
             resolve("report", replay.demo_log(), **how), tmp_path / str(processes), processes=processes
         )
@@ -57,11 +61,31 @@ def test_two_processes_write_the_same_bytes_as_one(tmp_path: Path, monkeypatch: 
         assert {"plan none", "plan qp", "plan scaling"} <= set(json.loads((folder / "timing.json").read_text()))
     assert found[0] == found[1]
     assert {"contact.parquet", "severity.parquet", "motion_none.parquet", "motion_scaling.parquet"} <= set(found[0])
-    assert set(taken) == {"_start", "_take", "_finish", "_take_there", "_coverages_there", "_tables_there"} | {
+    assert set(taken) == {"_start", "_take", "_finish", "_take_there", "_coverages_there", "_judge_there"} | {
         "_forget_there",
         "_write_scene",
         "draw_there",
     }
+
+
+def test_a_value_goes_to_the_other_process_by_a_file(tmp_path: Path) -> None:
+    shared, path = np.arange(12.0).reshape(3, 4), tmp_path / "value"
+    shared.setflags(write=False)
+    value = {
+        "a": shared,
+        "b": (shared, np.asfortranarray(shared + 1.0)),
+        "c": np.arange(10)[::2],
+        "d": np.empty((0, 3)),
+    }
+    write_apart(path, value)
+    found = read_apart(path)
+    assert found["a"] is found["b"][0], "once in memory"
+    for one, other in ((found["a"], shared), (found["b"][1], shared + 1.0), (found["c"], np.arange(0, 10, 2))):
+        np.testing.assert_array_equal(one, other)
+        assert one.dtype == other.dtype
+    assert found["d"].shape == (0, 3)
+    assert not found["a"].flags.writeable  # protected here, so there: kernels are compiled for one kind of array
+    found["b"][1][0, 0] = 7.0
 
 
 def test_two_processes_share_tasks_until_they_meet() -> None:

@@ -5,10 +5,12 @@ An event is a full stop of a method, or a contact of its moving robot with the r
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from hrcreplay.evaluation.contact import deciding_rows
 from hrcreplay.evaluation.severity import merged_runs
@@ -383,9 +385,9 @@ def _stops(motion: RunTable, t0_ns: int, slow: float) -> list[StopEvent]:
                 rest_s=float(lasts_s[last:again].sum()),
                 speed_m_per_s=float(speed[first]),
                 distance_m=float(distance[first]),
-                link=names["link"][first],
-                limb=names["limb"][first],
-                reason=names["reason"][first],
+                link=names["link"].at(first),
+                limb=names["limb"].at(first),
+                reason=names["reason"].at(first),
             )
         )
     return found
@@ -406,16 +408,26 @@ def _touches(contact: RunTable, t0_ns: int) -> list[StopEvent]:
                 rest_s=0.0,
                 speed_m_per_s=float(speed[first:last][touching[first:last]].max()),
                 distance_m=float(distance[at]),
-                link=names["link"][at],
-                limb=names["limb"][at],
+                link=names["link"].at(at),
+                limb=names["limb"].at(at),
                 reason="",
             )
         )
     return found
 
 
-def _names(table: RunTable) -> Mapping[str, Sequence[str]]:
-    """Returns the names in each row of a table, by column; empty where there is none, and in a column that it lacks."""
-    columns = [name for name in ("link", "limb", "reason") if name in table]
-    nothing = dict.fromkeys(("link", "limb", "reason"), [""] * len(table))
-    return nothing | {name: table[name].fillna("").astype(str).to_list() for name in columns}
+@dataclass(frozen=True)
+class _NameColumn:
+    """The names in a column of a table, which may lack it."""
+
+    values: pd.Series[Any] | None
+
+    def at(self, row: int) -> str:
+        """The name in a row; empty where there is none."""
+        name = None if self.values is None else self.values.iloc[row]
+        return "" if pd.isna(name) else str(name)
+
+
+def _names(table: RunTable) -> Mapping[str, _NameColumn]:
+    """Returns the columns with names of link, limb and reason."""
+    return {name: _NameColumn(table[name] if name in table.columns else None) for name in ("link", "limb", "reason")}
