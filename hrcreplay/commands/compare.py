@@ -37,7 +37,7 @@ from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.pipeline import assembly, reuse, stages
 from hrcreplay.pipeline.assembly import Follower, Recorded
 from hrcreplay.pipeline.kernel_build import ensure_compiled
-from hrcreplay.pipeline.planner import Planner
+from hrcreplay.pipeline.planner import METHOD_COST, Planner
 from hrcreplay.pipeline.progress import ProgressBar, print_note
 from hrcreplay.pipeline.robot_mass import robot_mass
 from hrcreplay.pipeline.run_config import RunConfig, RunOptions, resolve
@@ -61,9 +61,6 @@ from hrcreplay.store.stored_table import StoredTable
 #: tick's own stop; qp with sound volumes up to a fixed horizon; and the two methods of the paper with its volumes and
 #: its horizon.
 PRESET = "none,ssm,shield,scaling,qp,qp:sound:fixed,qp:paper:fixed,scaling:paper:fixed"
-
-#: Approximate relative cost of a tick by method; long tasks start first.
-_COST = {"qp": 5, "ssm": 4, "pfl": 4, "none": 3, "shield": 3, "scaling": 3, RECORDED: 2}
 
 
 @dataclass(frozen=True)
@@ -382,7 +379,7 @@ def _plan_all(tasks: Sequence[VariantTask], processes: int, advance: Callable[[i
     Returns:
         Duration of each task [s].
     """
-    order = sorted(tasks, key=lambda task: (task.ready, -_COST[task.variant.method]))
+    order = sorted(tasks, key=lambda task: (task.ready, -METHOD_COST[task.variant.method]))
     if processes < 2 or len(order) < 2:
         return {task.variant: plan(task, advance)[1] for task in order}
     took = {}

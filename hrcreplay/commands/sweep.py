@@ -31,6 +31,7 @@ from hrcreplay.commands.sweep_worker import FUSED, ROWS, RunOutcome, SweepTask, 
 from hrcreplay.errors import LogError, SettingsError
 from hrcreplay.pipeline import reuse
 from hrcreplay.pipeline.kernel_build import ensure_compiled
+from hrcreplay.pipeline.planner import METHOD_COST
 from hrcreplay.pipeline.progress import ProgressBar, print_note
 from hrcreplay.pipeline.run_config import RunConfig, RunOptions, resolve_without_log
 from hrcreplay.reporting import sweep_report
@@ -278,6 +279,12 @@ def _share_fusion(tasks: Sequence[SweepTask]) -> tuple[list[SweepTask], list[Swe
     return list(fusing.values()), found
 
 
+def in_order(runs: Sequence[SweepTask]) -> list[SweepTask]:
+    """Runs log by log, so that fused people are soon of no use, the long ones first, so that workers end together."""
+    logs = list(dict.fromkeys(task.log for task in runs))
+    return sorted(runs, key=lambda task: (logs.index(task.log), -METHOD_COST[task.run_config.settings.plan.method]))
+
+
 def _run_all(
     results: ResultsFolder, tasks: Sequence[SweepTask], scheduler: str | None, workers: int | None
 ) -> dict[str, str]:
@@ -292,7 +299,7 @@ def _run_all(
 
         shared = {one.name: client.submit(run_task, results.where, one, key=_key(results, one)) for one in fusing}
         futures = {}
-        for task in runs:
+        for task in in_order(runs):
             after = None if task.fused is None else shared[task.fused]
             futures[client.submit(run_task, results.where, task, after, key=_key(results, task))] = task
             sharing[task.fused or ""].add(task.name)

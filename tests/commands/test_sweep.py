@@ -52,6 +52,16 @@ def test_a_grid_gives_every_combination_once() -> None:
     assert len({one.name for one in found}) == len(found)
 
 
+def test_runs_go_log_by_log_and_the_longest_first() -> None:
+    settings = sweep.combine("plan", ["plan.method=none,qp,ssm", "plan.clearance_m=0,0.05"], [])
+    tasks = sweep.make_tasks(["b.mcap", "a.mcap"], settings, 250)
+    found = [(task.log, task.run_config.settings.plan.method) for task in sweep.in_order(tasks)]
+    assert found == [
+        (log, method) for log in ("b.mcap", "a.mcap") for method in ("qp", "ssm", "none") for _ in range(2)
+    ]
+    assert sorted(task.name for task in sweep.in_order(tasks)) == sorted(task.name for task in tasks)
+
+
 def test_values_with_commas_inside_stay_whole() -> None:
     found = sweep.combine("plan", ['plan.baselines=["none","scaling"],["ssm"]'], [])
     assert [one.run_config.settings.plan.baselines for one in found] == [("none", "scaling"), ("ssm",)]
