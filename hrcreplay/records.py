@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Self
+from typing import Any, Generic, NamedTuple, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -175,6 +175,61 @@ class Table:
         first = tables[0]
         names = [name for name, value in vars(first).items() if isinstance(value, np.ndarray)]
         return replace(first, **{name: np.concatenate([getattr(t, name) for t in tables]) for name in names})
+
+
+_Rows = TypeVar("_Rows")
+
+
+class Growing(Generic[_Rows]):
+    """Rows of a long run in arrays that grow: parts in a list would be in memory twice while they are joined.
+
+    A part is a dataclass whose arrays have time as their first axis; other fields are those of the first part.
+    """
+
+    #: Rows of the first arrays.
+    LEAST = 4096
+
+    def __init__(self) -> None:
+        self._first: Any = None
+        self._columns: dict[str, NDArray[Any]] = {}
+        self._rows = 0
+
+    def __len__(self) -> int:
+        return self._rows
+
+    def add(self, part: _Rows) -> None:
+        """Adds some rows.
+
+        Raises:
+            ValueError: The part lacks an array that the first one has, or the other way round.
+        """
+        arrays = {name: value for name, value in vars(part).items() if isinstance(value, np.ndarray)}
+        count = len(next(iter(arrays.values())))
+        if not count:
+            return
+        self._first = part if self._first is None else self._first
+        if self._columns and arrays.keys() != self._columns.keys():
+            raise ValueError(f"rows with {', '.join(arrays)}; those of the first part, {', '.join(self._columns)}")
+        for name, values in arrays.items():
+            self._room(name, values, self._rows + count)[self._rows : self._rows + count] = values
+        self._rows += count
+
+    def _room(self, name: str, like: NDArray[Any], rows: int) -> NDArray[Any]:
+        """The array of a column with room for so many rows; memory that no row has reached yet is not taken."""
+        before = self._columns.get(name)
+        if before is not None and rows <= len(before):
+            return before
+        room = max(rows, self.LEAST if before is None else 2 * len(before))
+        found = self._columns[name] = np.empty((room, *like.shape[1:]), like.dtype)
+        if before is not None:
+            found[: self._rows] = before[: self._rows]
+        return found
+
+    def take(self) -> _Rows | None:
+        """Returns all rows, None without any; it is empty then."""
+        first, columns, rows = self._first, self._columns, self._rows
+        self._first, self._columns, self._rows = None, {}, 0
+        return replace(first, **{name: values[:rows] for name, values in columns.items()}) if rows else None
 
 
 @dataclass(frozen=True)

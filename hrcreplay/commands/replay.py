@@ -36,6 +36,7 @@ from hrcreplay.reporting import tables
 from hrcreplay.reporting.summary_text import defect_notes
 from hrcreplay.store import run_folder
 from hrcreplay.store.columns import read_states
+from hrcreplay.store.memory import release_freed_memory
 from hrcreplay.store.run_folder import RunWriter, Stopwatch
 
 REPORTS = Path("reports")
@@ -187,8 +188,10 @@ def _report(
 
     ticks = pq.read_metadata(writer.partial / "state.parquet").num_rows
     progress.begin("contact")
+    release_freed_memory()
     with watch.stage("contact", ticks):
         write_contact(run_config, log, writer, assembly.robot_base(run_config, log), second, seen)
+    release_freed_memory()
     with watch.stage("report", ticks):
         write_report(run_config, writer, meta, log, progress, second)
 

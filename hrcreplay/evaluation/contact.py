@@ -58,6 +58,7 @@ from hrcreplay.store.columns import (
     read_states_at,
     state_columns,
 )
+from hrcreplay.store.memory import release_freed_memory
 from hrcreplay.store.run_folder import RunWriter, TableWriter, arrow_table
 from hrcreplay.store.stored_table import RunTable, StoredTable
 
@@ -146,6 +147,7 @@ def write_contact(
         seen: The bodies that stage 1 saw; None: the log is read again for them.
     """
     people = read_recorded_people(run_config, log, writer, seen)
+    release_freed_memory()
     judged = _JudgedRun(run_config, T_world_base, people, writer.partial)
     paths = sorted(writer.partial.glob("motion*.parquet"))
     coverages, there = judged.coverages, {}
@@ -250,6 +252,7 @@ _THERE: list[_JudgedRun] = []
 
 
 def _take_there(path: Path) -> None:
+    release_freed_memory()
     _THERE[:] = [read_apart(path)]
     path.unlink()
 
@@ -264,6 +267,7 @@ def _judge_there(path: Path) -> Columns:
 
 def _forget_there() -> None:
     _THERE.clear()
+    release_freed_memory()
 
 
 def body_table(people: RecordedPeople, at_ns: Ints, hand_m: float) -> Columns:

@@ -183,8 +183,8 @@ class Meeting:
             ticks: (k,) rows at which a body is known.
         """
         t_ns, source = contact["t_ns"].to_numpy()[ticks], contact["source"].iloc[ticks].to_numpy().astype(str)
-        names = [f"q{i + 1}" for i in range(self.robot.nv)]
-        q, dq = (motion[[f"{d}{name}" for name in names]].to_numpy(dtype=float)[ticks] for d in ("", "d"))
+        names, there = [f"q{i + 1}" for i in range(self.robot.nv)], motion.iloc[ticks]
+        q, dq = (there[[f"{d}{name}" for name in names]].to_numpy(dtype=float) for d in ("", "d"))
         for first in range(0, len(ticks), _BATCH):
             rows = slice(first, first + _BATCH)
             yield from self._impacts((method, kind), t_ns[rows], q[rows], dq[rows], source[rows])

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hrcreplay.human.fusion import inverse_kinematics
 from hrcreplay.human.fusion.vacancy import WatchedArea
 from hrcreplay.human.model import LimitSet
 from hrcreplay.logs.cleaning import PersonMemory, select_person
-from hrcreplay.records import NOBODY, Bools, CameraFrames, Floats, Ints, Measurements
+from hrcreplay.records import NOBODY, Bools, CameraFrames, Floats, Growing, Ints, Measurements
 from hrcreplay.settings.sections import Fusion
 
 
@@ -40,8 +39,8 @@ class SeenBodies:
     """All bodies that cameras show in a run, from which the recorded people are made."""
 
     def __init__(self) -> None:
-        self._people = GrowingFrames()  # their number as body id
-        self._others = GrowingFrames()
+        self._people = Growing[CameraFrames]()  # their number as body id
+        self._others = Growing[CameraFrames]()
 
     def add(self, sightings: Sightings) -> None:
         """Adds those of some frames; points in the world."""
@@ -51,45 +50,6 @@ class SeenBodies:
     def take(self) -> tuple[CameraFrames | None, CameraFrames | None]:
         """Returns the people and all others, None for no rows; it is empty then, as a long run's take memory."""
         return self._people.take(), self._others.take()
-
-
-class GrowingFrames:
-    """Frames of a long run in arrays that grow: lists of parts would be in memory twice while they are joined."""
-
-    #: Rows of the first arrays.
-    LEAST = 4096
-
-    def __init__(self) -> None:
-        self._columns: dict[str, NDArray[np.generic]] = {}
-        self._cameras: tuple[str, ...] = ()
-        self._rows = 0
-
-    def add(self, frames: CameraFrames) -> None:
-        """Adds some frames."""
-        if not len(frames):
-            return
-        self._cameras, end = frames.cameras, self._rows + len(frames)
-        for name, values in vars(frames).items():
-            if isinstance(values, np.ndarray):
-                if name not in self._columns or end > len(self._columns[name]):
-                    self._grow(name, values, end)
-                self._columns[name][self._rows : end] = values
-        self._rows = end
-
-    def _grow(self, name: str, like: NDArray[np.generic], rows: int) -> None:
-        """Makes room for rows, twice as many as before; memory that no row has reached yet is not taken."""
-        before = self._columns.get(name)
-        room = max(rows, self.LEAST if before is None else 2 * len(before))
-        self._columns[name] = np.empty((room, *like.shape[1:]), like.dtype)
-        if before is not None:
-            self._columns[name][: self._rows] = before[: self._rows]
-
-    def take(self) -> CameraFrames | None:
-        """Returns all frames, None without any; it is empty then."""
-        columns: dict[str, Any] = {name: values[: self._rows] for name, values in self._columns.items()}
-        found = CameraFrames(**columns, cameras=self._cameras) if self._rows else None
-        self._columns, self._rows = {}, 0
-        return found
 
 
 def as_frames(measured: Measurements) -> CameraFrames:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from hrcreplay.human.fusion import fuse, smoother
-from hrcreplay.records import HumanStates
+from hrcreplay.records import Growing, HumanStates
 from hrcreplay.settings.sections import Fusion
 
 
@@ -48,30 +48,30 @@ class StretchSmoother:
 
     def __init__(self, settings: Fusion) -> None:
         self._settings = settings
-        self._parts: list[tuple[HumanStates, fuse.Trace]] = []
-        self._count = 0
+        self._states = Growing[HumanStates]()
+        self._trace = Growing[fuse.Trace]()
 
     def add(self, states: HumanStates, trace: fuse.Trace) -> list[HumanStates]:
         """Adds the next ticks; returns the stretches that they complete, smoothed."""
-        self._parts.append((states, trace))
-        self._count += len(states)
+        self._states.add(states)
+        self._trace.add(trace)
         found = []
-        while self._count >= self.TICKS + self.LATER:
+        while len(self._states) >= self.TICKS + self.LATER:
             found.append(self._smooth(self.TICKS))
         return found
 
     def finish(self) -> list[HumanStates]:
         """Returns the remaining ticks, smoothed."""
         found = []
-        while self._count:
-            found.append(self._smooth(min(self._count, self.TICKS)))
+        while len(self._states):
+            found.append(self._smooth(min(len(self._states), self.TICKS)))
         return found
 
     def _smooth(self, count: int) -> HumanStates:
         """Smooths the next ``count`` ticks and removes them from memory."""
-        states = HumanStates.join([part for part, _ in self._parts])
-        trace = fuse.Trace.join([part for _, part in self._parts])
-        known, rest = slice(0, count + self.LATER), np.arange(count, len(states))
-        self._parts = [(states.rows(rest), trace.rows(rest))]  # copies: views would keep the whole stretch in memory
-        self._count -= count
+        states, trace = self._states.take(), self._trace.take()
+        assert states is not None and trace is not None  # noqa: PT018, S101 - for the type checker
+        known, rest = slice(0, count + self.LATER), slice(count, len(states))
+        self._states.add(states.rows(rest))
+        self._trace.add(trace.rows(rest))
         return smoother.smooth(states.rows(known), trace.rows(known), self._settings).rows(slice(0, count))

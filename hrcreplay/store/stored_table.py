@@ -18,6 +18,8 @@ from hrcreplay.records import Bools, Ints
 #: An array of any type.
 Anything = np.ndarray[tuple[int, ...], np.dtype[Any]]
 
+#: Number of groups of rows that are read together when only some of their rows are needed.
+_GROUPS = 16
 #: Memory of the columns of one file that are kept, as most are asked for more than once [bytes].
 _KEPT_BYTES = 16_000_000
 
@@ -139,17 +141,23 @@ class _File:
 
     def read(self, names: list[str], rows: Bools | None) -> pd.DataFrame:
         """Some columns, of all rows or of those (n,) that are True."""
-        groups = [] if rows is None else [i for i, (a, b) in enumerate(pairwise(self._starts)) if rows[a:b].any()]
-        if rows is None or 2 * len(groups) > len(self._starts) - 1:
-            whole = {name: self._column(name) for name in names}
-            return pd.DataFrame(
-                {name: x if rows is None else x[rows].reset_index(drop=True) for name, x in whole.items()}
-            )
-        groups = groups or [0]
-        kept = np.concatenate([rows[self._starts[i] : self._starts[i + 1]] for i in groups])
+        if rows is None:
+            return pd.DataFrame({name: self._column(name) for name in names})
+        groups = [i for i, (a, b) in enumerate(pairwise(self._starts)) if rows[a:b].any()]
+        if len(names) == 1 and 2 * len(groups) > len(self._starts) - 1:  # it may be asked for again
+            return pd.DataFrame({names[0]: self._column(names[0])[rows].reset_index(drop=True)})
+        return self._some(names, rows, groups or [0])
+
+    def _some(self, names: list[str], rows: Bools, groups: list[int]) -> pd.DataFrame:
+        """Some rows of some columns, read few groups of rows at a time: all columns of a long run would fill memory."""
+        found = []
         with pq.ParquetFile(self._path, metadata=self._about) as file:
-            table = file.read_row_groups(groups, columns=names, use_threads=False)
-        return table.filter(pa.array(kept)).to_pandas(split_blocks=True, self_destruct=True)
+            for k in range(0, len(groups), _GROUPS):
+                few = groups[k : k + _GROUPS]
+                kept = np.concatenate([rows[self._starts[i] : self._starts[i + 1]] for i in few])
+                table = file.read_row_groups(few, columns=names, use_threads=False)
+                found.append(table.filter(pa.array(kept)))
+        return pa.concat_tables(found).to_pandas(split_blocks=True, self_destruct=True)
 
     def _column(self, name: str) -> pd.Series[Any]:
         """A whole column, kept or read."""

@@ -175,6 +175,8 @@ def thin_stretches(points: Floats, tolerance: float) -> list[Floats]:
 #: Edge of the cells in which vertices of a path are searched together, and distance below which vertices are merged
 #: [m].
 _CELL_M, _SAME_M = 2e-4, 1e-6
+#: Number of points whose feet are found together: all of a long run would be in memory ten times.
+_TOGETHER = 65_536
 
 
 def path_feet(points: Floats, path: Floats) -> Floats:
@@ -187,8 +189,16 @@ def path_feet(points: Floats, path: Floats) -> Floats:
     known = np.isfinite(points).all(axis=1)
     if not len(path) or not known.any():
         return feet
-    at = points[known]
-    nearest = _nearest_vertices(at, path)
+    rows = np.flatnonzero(known)
+    nearest = _nearest_vertices(points[rows], path)
+    for first in range(0, len(rows), _TOGETHER):
+        some = slice(first, first + _TOGETHER)
+        feet[rows[some]] = _feet_beside(points[rows[some]], path, nearest[some])
+    return feet
+
+
+def _feet_beside(at: Floats, path: Floats, nearest: Ints) -> Floats:
+    """Returns (n, 3) nearest points on the two segments at the nearest vertex (n,) of each of (n, 3) points [m]."""
     best = path[nearest]
     best_m = np.linalg.norm(at - best, axis=1)
     for other in (np.maximum(nearest - 1, 0), np.minimum(nearest + 1, len(path) - 1)):
@@ -199,8 +209,7 @@ def path_feet(points: Floats, path: Floats) -> Floats:
         foot_m = np.linalg.norm(at - foot, axis=1)
         better = foot_m < best_m
         best, best_m = np.where(better[:, None], foot, best), np.where(better, foot_m, best_m)
-    feet[known] = best
-    return feet
+    return best
 
 
 def _nearest_vertices(points: Floats, path: Floats) -> Ints:
