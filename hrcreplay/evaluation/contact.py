@@ -56,7 +56,6 @@ from hrcreplay.store.columns import (
     person_columns,
     read_states,
     read_states_at,
-    state_columns,
 )
 from hrcreplay.store.memory import release_freed_memory
 from hrcreplay.store.run_folder import RunWriter, TableWriter, arrow_table
@@ -98,7 +97,7 @@ def read_recorded_people(
     def smoothed() -> SmoothedPeople:
         if not path.exists():
             for part in _smooth(run_config, log, ticks_ns):
-                writer.table("smooth", state_columns(part))
+                stages.write_smoothed(part, writer)
             writer.close_tables()
         return _read_smoothed(path)
 

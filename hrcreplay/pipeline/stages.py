@@ -43,7 +43,7 @@ from hrcreplay.store.columns import (
     static_columns,
     truth_columns,
 )
-from hrcreplay.store.run_folder import Stopwatch, Tables
+from hrcreplay.store.run_folder import Stopwatch, Tables, TableWriter
 
 NS = 1_000_000_000
 #: Prefixes of the names of counters for defective points and lost bodies.
@@ -238,7 +238,13 @@ def _note_findings(
 
 def _write_smoothed(parts: Iterable[HumanStates], sink: Sink) -> None:
     for part in parts:
-        sink.tables.table("smooth", state_columns(part))
+        write_smoothed(part, sink.tables)
+
+
+def write_smoothed(part: HumanStates, tables: Tables) -> None:
+    """Writes a stretch of the smoothed people, some rows at a time: as columns they would be in memory three times."""
+    for first in range(0, len(part), TableWriter.ROWS):
+        tables.table("smooth", state_columns(part.rows(slice(first, first + TableWriter.ROWS))))
 
 
 def _describe_others(counts: Counter[str]) -> Iterator[str]:

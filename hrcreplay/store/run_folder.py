@@ -81,10 +81,12 @@ class TableWriter:
             if table.num_columns > self._waiting[0].num_columns:
                 self._widen(table.column_names)
         self._waiting.append(table)
-        while sum(len(table) for table in self._waiting) >= self.ROWS:
+        if sum(len(table) for table in self._waiting) >= self.ROWS:
             table = pa.concat_tables(self._waiting).combine_chunks()
-            self._flush(table.slice(0, self.ROWS))
-            self._waiting = [table.slice(self.ROWS)]
+            whole = len(table) // self.ROWS * self.ROWS
+            for first in range(0, whole, self.ROWS):
+                self._flush(table.slice(first, self.ROWS))
+            self._waiting = [table.slice(whole)]
 
     def _widen(self, names: Sequence[str]) -> None:
         """Writes all rows so far again, with the optional columns among ``names``."""
