@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import fields
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,8 +16,11 @@ from hrcreplay.human.fusion.smoother import smooth
 from hrcreplay.human.model import skeleton
 from hrcreplay.limits import load_limits
 from hrcreplay.pipeline.people_smoother import StretchSmoother
+from hrcreplay.pipeline.stages import write_smoothed
 from hrcreplay.records import Growing, HumanStates
 from hrcreplay.settings.sections import Fusion
+from hrcreplay.store.columns import state_columns
+from hrcreplay.store.run_folder import TableWriter
 from tests.human.sightings import CAMERAS, LENGTHS_M, NEUTRAL, frames_of
 
 TICKS, LATER, N = 40, 15, 130
@@ -78,3 +83,23 @@ def test_what_waits_for_the_next_stretch_does_not_keep_the_whole_one(
     for array in kept.values():
         assert array.base is None
         assert len(array) == LATER
+
+
+def test_smoothed_people_are_written_some_rows_at_a_time(
+    run: tuple[HumanStates, Trace], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written: list[Mapping[str, Any]] = []
+
+    class Kept:
+        """Tables in memory."""
+
+        def table(self, name: str, columns: Mapping[str, Any], /) -> None:
+            """Keeps the rows."""
+            assert name == "smooth"
+            written.append(columns)
+
+    monkeypatch.setattr(TableWriter, "ROWS", 48)
+    write_smoothed(run[0], Kept())
+    assert [len(part["t_ns"]) for part in written] == [48, 48, 34]
+    for name, column in state_columns(run[0]).items():
+        np.testing.assert_array_equal(np.concatenate([part[name] for part in written]), column)

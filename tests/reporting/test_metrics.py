@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 
 from hrcreplay.records import JOINTS
+from hrcreplay.reporting.metrics import series
 from hrcreplay.reporting.metrics.planning import add_plan, cycles, waited_s
 from hrcreplay.reporting.metrics.series import MetricTable, path_feet
 from hrcreplay.store.run_folder import Run
@@ -295,6 +296,11 @@ def test_distance_from_a_path_that_was_driven_many_times() -> None:
     want = np.linalg.norm(start + share[..., None] * along - points[:, None], axis=2).min(axis=1)
     np.testing.assert_allclose(np.linalg.norm(path_feet(points, path) - points, axis=1), want, atol=2e-5)
     np.testing.assert_allclose(path_feet(path, path), path, atol=2e-5)
+    points[::7] = np.nan
+    together = path_feet(points, path)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(series, "_TOGETHER", 11)
+        np.testing.assert_array_equal(path_feet(points, path), together)
 
 
 def test_a_reference_waits_where_its_time_stands() -> None:

@@ -18,8 +18,9 @@ N, GROUP = 1000, 64
 
 
 @pytest.fixture
-def tables(tmp_path: Path) -> tuple[StoredTable, pd.DataFrame]:
-    """The same table stored in groups of rows, and in memory."""
+def tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[StoredTable, pd.DataFrame]:
+    """The same table stored in groups of rows, few of which are read together, and in memory."""
+    monkeypatch.setattr(stored_table, "_GROUPS", 3)
     rng = np.random.default_rng(3)
     frame = pd.DataFrame(
         {
