@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from hrcreplay.egm.codec import Correction
 from hrcreplay.egm.link import JUMPED
 from hrcreplay.egm.robot_double.faults import Fault
 from hrcreplay.human.fusion import fuse
@@ -291,6 +292,28 @@ def test_what_the_watchdog_looks_up_of_fresh_people_is_what_it_would_compute() -
             assert fresh.reason == said
             told.add(said)
     assert told == {"", session_controller.UNCERTAIN, session_controller.NOT_FINITE}
+
+
+@pytest.mark.parametrize(("further_rad", "share"), [(1e-4, 1.0), (0.0, 0.5)])
+def test_a_reply_other_than_the_command_begins_a_new_stop(
+    further_rad: float, share: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flight = Flight().fly(3.0)
+    controller, session = flight.controller, flight.controller._session
+    reply = session.reply
+
+    def limited(q: Floats, dq: Floats, t_ns: int) -> Correction:
+        told = reply(q, dq, t_ns)
+        return replace(told, q=told.q + further_rad, dq=share * told.dq)
+
+    assert moved(flight, after=-5)
+    monkeypatch.setattr(session, "reply", limited)
+    flight.fly(2 * CYCLE_S)
+    motion, told = controller._motion, flight.said()[-1]
+    assert motion is not None
+    assert_allclose(motion.state.q, told.q, atol=1e-12)
+    assert_array_equal(motion.stop.q[0], motion.state.q)
+    assert_array_equal(motion.stop.dq[0], motion.state.dq)
 
 
 def test_a_bug_in_the_stages_brakes_the_robot_and_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
