@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -184,8 +185,19 @@ def test_a_contact_is_laid_at_the_door_of_robot_or_prediction(robot: RobotModel)
         np.testing.assert_array_equal(np.flatnonzero(np.isfinite(outside)), touching)
         np.testing.assert_allclose(outside[touching], 0.2 + 0.05 - ball_m, atol=3e-3)
         assert (np.sign(outside[touching]) == sign).all()
-        decided = touching[2] - 4
+        decided, known_before = touching[2] - 4, len(known.asked)
         assert known.asked[-1] == (decided * DT_NS, 0.04)
+        decisions, parts = contact.Decisions.of(motion), []
+        for rows in (
+            slice(0, int(touching[1])),
+            slice(int(touching[1]), int(touching[4])),
+            slice(int(touching[4]), 81),
+        ):
+            some = contact.Nearest(*(getattr(found, name)[rows] for name in found.__dataclass_fields__))
+            given: Any = motion.iloc[rows], decisions.by_rows(rows), some, alone, RADII_M, 0.0, known
+            parts.append(contact.by_volume(*given))
+        np.testing.assert_array_equal(np.concatenate(parts), outside)  # what was decided in an earlier stretch goes on
+        assert set(known.asked[known_before:]) == set(known.asked[:known_before])
     no_legs = Known(at, 0.5)
     no_legs.solid = {"LEGS": no_legs.solid["LRA"]}
     assert np.isnan(contact.by_volume(motion, contact.Decisions.of(motion), found, alone, RADII_M, 0.0, no_legs)).all()  # type: ignore[arg-type]

@@ -13,6 +13,7 @@ import pytest
 
 from hrcreplay.commands import replay
 from hrcreplay.commands.report import summary
+from hrcreplay.evaluation.recorded_person import CameraPoints
 from hrcreplay.geometry.distances import segment_distance
 from hrcreplay.logs.reader import open_log
 from hrcreplay.logs.writer import LogWriter
@@ -190,3 +191,19 @@ def test_report_compare_and_audit_have_one_coverage(tmp_path: Path) -> None:
     log = rewritten(tmp_path / "log.mcap")
     reported(log, tmp_path / "report")
     assert assert_one_coverage(tmp_path / "report", tmp_path) > 40
+
+
+def test_the_points_of_a_camera_are_its_rows_with_the_neck_between_the_shoulders() -> None:
+    all_m = np.random.default_rng(3).normal(size=(30, len(POINTS), 3))
+    neck, right, left = (POINTS.index(name) for name in ("neck", "shoulder_r", "shoulder_l"))
+    all_m[5, left], all_m[6, neck] = np.nan, np.nan
+    before, mine = all_m.copy(), np.array([1, 5, 6, 20])
+    points = CameraPoints(all_m, mine)
+    assert points.shape == (4, len(POINTS), 3)
+    for rows in (slice(None), slice(1, 3), np.array([3, 0, 0])):
+        for found, row in zip(points[rows], mine[rows].tolist(), strict=True):
+            expected = before[row].copy()
+            if row != 5:  # a shoulder is not shown there
+                expected[neck] = 0.5 * (before[row, left] + before[row, right])
+            np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(all_m, before)
