@@ -24,10 +24,10 @@ from hrcreplay.commands.notes import notes_of
 from hrcreplay.errors import SettingsError
 from hrcreplay.evaluation.contact import (
     Coverages,
+    JudgedMotion,
     Predicted,
     compute_full_coverage,
     compute_own_coverage,
-    contact_rows,
     read_recorded_people,
     write_rows,
 )
@@ -427,8 +427,8 @@ def plan(task: VariantTask, progress: Callable[[int], None] | None = None) -> tu
     recorded = task.programme.recorded if task.variant.method == RECORDED else None
     capsules = recorded if isinstance(recorded, RecordedCapsules) else None
     method, people = task.variant.method, task.people
-    every = contact_rows(run_config, robot, method, motion, people, predicted, own, full, capsules)
-    meetings = write_rows(every, partial(writer.table, f"contact_{slug}"))
+    judged = JudgedMotion(run_config, robot, method, motion, people, predicted, own, full, capsules)
+    meetings = write_rows(judged.rows(), partial(writer.table, f"contact_{slug}"))
     writer.table(f"severity_{slug}", severity_table(run_config, robot, method, motion, meetings, people, capsules))
     writer.close_tables()
     return done, time.perf_counter() - began_s

@@ -239,9 +239,9 @@ class _JudgedRun:
         motion, own, full = StoredTable(path), None, None
         if path.stem == "motion":
             own, full = (coverages or self.coverages)()
-        every = contact_rows(run_config, self.robot, method, motion, people, self.predicted, own, full, capsules)
+        judged = JudgedMotion(run_config, self.robot, method, motion, people, self.predicted, own, full, capsules)
         rows = TableWriter(self.rows_of(path))
-        meetings = write_rows(every, rows.write)
+        meetings = write_rows(judged.rows(), rows.write)
         rows.close()
         return severity_table(run_config, self.robot, method, motion, meetings, people, capsules)
 
@@ -329,7 +329,7 @@ def _coverage(
 
 
 def write_rows(every: Iterator[Columns], write: Callable[[Columns], None]) -> pd.DataFrame:
-    """Writes the rows of ``contact_rows`` one after the other; returns what ``severity_table`` needs of all of them."""
+    """Writes the rows of a ``JudgedMotion`` in turn; returns what ``severity_table`` needs of all of them."""
     met = []
     for rows in every:
         write(rows)
@@ -337,100 +337,71 @@ def write_rows(every: Iterator[Columns], write: Callable[[Columns], None]) -> pd
     return pa.concat_tables(met).to_pandas()
 
 
-def contact_rows(
-    run_config: RunConfig,
-    robot: RobotModel,
-    method: str,
-    motion: RunTable,
-    people: RecordedPeople,
-    predicted: Predicted,
-    own: Coverages | None,
-    full: Coverages | None,
-    capsules: RecordedCapsules | None = None,
-) -> Iterator[Columns]:
-    """Computes the rows of contact.parquet for one motion, one stretch of ticks after the other.
+@dataclass(frozen=True)
+class JudgedMotion:
+    """A motion beside the recorded people, of which the rows of contact.parquet are made."""
 
-    Args:
-        run_config: The run.
-        robot: Robot at its base pose in the world.
-        method: Method of the motion.
-        motion: Rows of a motion table.
-        people: Recorded people.
-        predicted: Volumes of any tick.
-        own: Result of ``compute_own_coverage``; None if not computed.
-        full: Result of ``compute_full_coverage``; None if not computed.
-        capsules: The robot as recorded by its capsules, in place of the links of ``robot``; None: no such robot.
-    """
-    decisions = None if method in (*UNGUARDED, *ALLOWING_CONTACT) else Decisions.of(motion)
-    for first in range(0, len(motion), _STRETCH):
-        rows = slice(first, first + _STRETCH)
-        some, used = motion.iloc[rows], None if decisions is None else decisions.by_rows(rows)
-        yield _rows_of(run_config, robot, method, some, people, predicted, used, own, full, capsules)
+    run_config: RunConfig
+    robot: RobotModel  #: at its base pose in the world
+    method: str  #: of the motion
+    motion: RunTable
+    people: RecordedPeople
+    predicted: Predicted  #: volumes of any tick
+    own: Coverages | None  #: result of ``compute_own_coverage``; None if not computed
+    full: Coverages | None  #: result of ``compute_full_coverage``; None if not computed
+    capsules: RecordedCapsules | None = None  #: the robot as recorded by them, in place of its links; None: none
 
+    def rows(self) -> Iterator[Columns]:
+        """Computes the rows of contact.parquet, one stretch of ticks after the other."""
+        decisions = None if self.method in (*UNGUARDED, *ALLOWING_CONTACT) else Decisions.of(self.motion)
+        for first in range(0, len(self.motion), _STRETCH):
+            rows = slice(first, first + _STRETCH)
+            yield self._stretch(self.motion.iloc[rows], None if decisions is None else decisions.by_rows(rows))
 
-def _rows_of(
-    run_config: RunConfig,
-    robot: RobotModel,
-    method: str,
-    motion: pd.DataFrame,
-    people: RecordedPeople,
-    predicted: Predicted,
-    decisions: Decisions | None,
-    own: Coverages | None,
-    full: Coverages | None,
-    capsules: RecordedCapsules | None,
-) -> Columns:
-    """Computes the rows of contact.parquet for a stretch of a motion.
+    def _stretch(self, motion: pd.DataFrame, decisions: Decisions | None) -> Columns:
+        """Computes some rows of contact.parquet.
 
-    Args:
-        run_config: The run.
-        robot: Robot at its base pose in the world.
-        method: Method of the motion.
-        motion: Rows of a motion table.
-        people: Recorded people.
-        predicted: Volumes of any tick.
-        decisions: Those that led to these rows; None: the method uses no volumes.
-        own: Result of ``compute_own_coverage``; None if not computed.
-        full: Result of ``compute_full_coverage``; None if not computed.
-        capsules: The robot as recorded by its capsules, in place of the links of ``robot``; None: no such robot.
-    """
-    prediction, t_ns = run_config.settings.prediction, motion["t_ns"].to_numpy()
-    radii_m = part_radii(prediction, run_config.settings.report.leg_radius_m)
-    groups = [*(one.tracks for one in people.people), people.others]
-    if capsules is None:
-        links, moving = tuple(segment.name for segment in robot.segments), _is_turning(motion)
-        *each, other = nearest(robot, motion, groups, radii_m, prediction.hand_m)
-    else:
-        links, sample = capsules.names, capsules.sample(t_ns)
-        moving = np.asarray(np.nan_to_num(sample.velocity).any(axis=(1, 2, 3)))
-        *each, other = (nearest_capsule(sample, t_ns, tracks, radii_m, prediction.hand_m) for tracks in groups)
-    person = _nearest_person(each, people)
-    worst, of_other = choose_nearer(person, other)
-    outside_m = np.full(len(t_ns), np.nan)
-    if decisions is not None:
-        outside_m = by_volume(motion, decisions, person, people, radii_m, prediction.hand_m, predicted)
-    nobody: Coverages = [None] * len(each)
-    pairs = zip(own or nobody, full or nobody, strict=True)
-    of_each = [(_measure_left(a, t_ns), _measure_left(b, t_ns)) for a, b in pairs]
-    columns = contact_columns(
-        t_ns=t_ns,
-        method=method,
-        person=people.source,
-        moving=moving,
-        distance_m=worst.distance_m,
-        part=(worst.part, PARTS),
-        link=(worst.link, links),
-        speeds=(motion["tcp_speed"].to_numpy(dtype=float), worst.speed),
-        source=(np.where(of_other, len(people.person) + worst.track, worst.track), people.names),
-        apart=(person.distance_m, other.distance_m),
-        outside_m=outside_m,
-        left=(*_worst_left([a for a, _ in of_each]), BODY),
-        left_full=(*_worst_left([b for _, b in of_each]), BODY),
-    )
-    if len(each) > 1:
-        for one, pair, (a, b) in zip(people.people, each, of_each, strict=True):
-            columns |= person_columns(one.number, pair.distance_m, a[0], b[0])
-    return columns
+        Args:
+            motion: The rows of the motion.
+            decisions: Those that led to these rows; None: the method uses no volumes.
+        """
+        people, prediction, t_ns = self.people, self.run_config.settings.prediction, motion["t_ns"].to_numpy()
+        radii_m = part_radii(prediction, self.run_config.settings.report.leg_radius_m)
+        groups = [*(one.tracks for one in people.people), people.others]
+        if self.capsules is None:
+            links, moving = tuple(segment.name for segment in self.robot.segments), _is_turning(motion)
+            *each, other = nearest(self.robot, motion, groups, radii_m, prediction.hand_m)
+        else:
+            links, sample = self.capsules.names, self.capsules.sample(t_ns)
+            moving = np.asarray(np.nan_to_num(sample.velocity).any(axis=(1, 2, 3)))
+            *each, other = (nearest_capsule(sample, t_ns, tracks, radii_m, prediction.hand_m) for tracks in groups)
+        person = _nearest_person(each, people)
+        worst, of_other = choose_nearer(person, other)
+        outside_m = np.full(len(t_ns), np.nan)
+        if decisions is not None:
+            outside_m = by_volume(motion, decisions, person, people, radii_m, prediction.hand_m, self.predicted)
+        nobody: Coverages = [None] * len(each)
+        pairs = zip(self.own or nobody, self.full or nobody, strict=True)
+        of_each = [(_measure_left(a, t_ns), _measure_left(b, t_ns)) for a, b in pairs]
+        columns = contact_columns(
+            t_ns=t_ns,
+            method=self.method,
+            person=people.source,
+            moving=moving,
+            distance_m=worst.distance_m,
+            part=(worst.part, PARTS),
+            link=(worst.link, links),
+            speeds=(motion["tcp_speed"].to_numpy(dtype=float), worst.speed),
+            source=(np.where(of_other, len(people.person) + worst.track, worst.track), people.names),
+            apart=(person.distance_m, other.distance_m),
+            outside_m=outside_m,
+            left=(*_worst_left([a for a, _ in of_each]), BODY),
+            left_full=(*_worst_left([b for _, b in of_each]), BODY),
+        )
+        if len(each) > 1:
+            for one, pair, (a, b) in zip(people.people, each, of_each, strict=True):
+                columns |= person_columns(one.number, pair.distance_m, a[0], b[0])
+        return columns
 
 
 def _nearest_person(each: Sequence[Nearest], people: RecordedPeople) -> Nearest:
