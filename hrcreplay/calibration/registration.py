@@ -27,6 +27,7 @@ _COARSE = 1200  # maximum number of instants during the search for offsets
 _ROUGH = 400  # maximum number of instants for an offset accurate to a frame
 _TOGETHER = 20  # minimum number of frames of both with a point
 _OVERLAP = 0.4  # minimum share of the maximum number of point pairs over all offsets
+_BATCH = 4096  # number of frames whose neighbours are compared together
 
 
 @dataclass(frozen=True)
@@ -211,12 +212,14 @@ def _without_jumps(track: SkeletonTrack) -> SkeletonTrack:
     They are removed before smoothing, which would spread them over their neighbours.
     """
     n = len(track)
-    around = np.clip(np.arange(n)[:, None] + np.arange(-2, 3), 0, n - 1)
     seen = np.isfinite(track.points_m).all(axis=2) & (track.confidence > 0)
-    points = np.where(seen[..., None], track.points_m, np.nan)
     filled = np.where(seen[..., None], track.points_m, 0.0)
-    middle = np.median(np.where(np.isnan(points[around]), filled[:, None], points[around]), axis=1)
-    jumps = np.linalg.norm(filled - middle, axis=2) > 0.15
+    jumps = np.zeros_like(seen)
+    for first in range(0, n, _BATCH):  # five times the frames of a long track would fill the memory
+        rows = np.arange(first, min(first + _BATCH, n))
+        around = np.clip(rows[:, None] + np.arange(-2, 3), 0, n - 1)
+        middle = np.median(np.where(seen[around][..., None], filled[around], filled[rows][:, None]), axis=1)
+        jumps[rows] = np.linalg.norm(filled[rows] - middle, axis=2) > 0.15
     return SkeletonTrack(track.t_ns, filled, np.where(seen & ~jumps, track.confidence, 0.0))
 
 

@@ -50,7 +50,7 @@ from hrcreplay.robot.control.control_step import (
 from hrcreplay.robot.control.controllers import Controller, QpController
 from hrcreplay.store.columns import motion_columns, read_states_at
 from hrcreplay.store.run_folder import arrow_table
-from hrcreplay.store.stored_table import RunTable, StoredTable
+from hrcreplay.store.stored_table import RunTable, StoredTable, number_columns, text_column
 
 #: A TCP slower than this counts as stationary [m/s].
 _STANDS = 1e-3
@@ -76,10 +76,9 @@ class Record:
     def __post_init__(self) -> None:
         axes = range(1, 1 + sum(name[0] == "u" and name[1:].isdigit() for name in self.motion.columns))
         self._q, self._dq, self._u = (  # row by row, as everywhere else: kernels are compiled anew for other layouts
-            np.ascontiguousarray(self.motion[[f"{name}{i}" for i in axes]].to_numpy(dtype=float))
-            for name in ("q", "dq", "u")
+            np.ascontiguousarray(number_columns(self.motion, [f"{name}{i}" for i in axes])) for name in ("q", "dq", "u")
         )
-        self._status = self.motion["status"].astype(str).to_numpy()
+        self._status = text_column(self.motion, "status")
         self.states = StoredTable(self.folder / "state.parquet")
         self.ticks_ns, self.first = ticks_of(self.states["t_ns"].to_numpy())
         self._batch: tuple[int, HumanStates] | None = None

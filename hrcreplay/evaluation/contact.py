@@ -14,6 +14,7 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from hrcreplay.evaluation.containment import Coverage, Outcome
-from hrcreplay.evaluation.recorded_person import BodyTrack, RecordedPeople, SmoothedPeople, read_people
+from hrcreplay.evaluation.recorded_person import BodyTrack, RecordedPeople, SmoothedPeople, gather, read_people
 from hrcreplay.evaluation.severity import MET, severity_table
 from hrcreplay.geometry.distances import nearest_pair, protrusion_m
 from hrcreplay.human.model import LEG_PARTS, PARTS, part_radii
@@ -59,7 +60,7 @@ from hrcreplay.store.columns import (
 )
 from hrcreplay.store.memory import release_freed_memory
 from hrcreplay.store.run_folder import RunWriter, TableWriter, arrow_table
-from hrcreplay.store.stored_table import RunTable, StoredTable
+from hrcreplay.store.stored_table import RunTable, StoredTable, text_column
 
 _BATCH = 4096
 #: Ticks whose rows are made and written together: a long run's motions would fill the memory.
@@ -80,7 +81,11 @@ Volumes = Mapping[str, SweptVolume]
 
 
 def read_recorded_people(
-    run_config: RunConfig, log: Log, writer: RunWriter, seen: SeenBodies | None = None
+    run_config: RunConfig,
+    log: Log,
+    writer: RunWriter,
+    seen: SeenBodies | None = None,
+    folder: Path | None = None,
 ) -> RecordedPeople:
     """Reads all people in the log of a run; writes smooth.parquet if it and the ground truth are missing.
 
@@ -89,6 +94,7 @@ def read_recorded_people(
         log: Log of the run.
         writer: Run folder with complete tables.
         seen: The bodies that stage 1 saw; None: the log is read again for them.
+        folder: Folder for files of the people's points, as long as they are needed; None: they stay in memory.
     """
     ticks_ns = np.unique(StoredTable(writer.partial / "state.parquet")["t_ns"].to_numpy())
     fusion_stage = assembly.fusion_stage(run_config, log)
@@ -99,21 +105,25 @@ def read_recorded_people(
             for part in _smooth(run_config, log, ticks_ns):
                 stages.write_smoothed(part, writer)
             writer.close_tables()
-        return _read_smoothed(path)
+        return _read_smoothed(path, folder)
 
-    return read_people(log, ticks_ns, fusion_stage, smoothed, seen)
+    return read_people(log, ticks_ns, fusion_stage, smoothed, seen, folder)
 
 
-def _read_smoothed(path: Path) -> SmoothedPeople:
-    """Reads what is needed of smooth.parquet, column by column, as a whole table of them would be there three times."""
+def _read_smoothed(path: Path, folder: Path | None) -> SmoothedPeople:
+    """Reads what is needed of smooth.parquet; joints and lengths go to files in the folder, some rows at a time."""
     table = StoredTable(path)
-    p, lengths_m = np.empty((len(table), len(JOINTS))), np.empty((len(table), len(LENGTHS)))
-    for values, names in ((p, JOINTS), (lengths_m, LENGTHS)):
-        for k, name in enumerate(names):
-            values[:, k] = table[name]
+    p, lengths_m = (gather(_read_columns(path, names), folder) for names in (JOINTS, LENGTHS))
     used = table[[name for name in table.columns if name.startswith("valid_")]].to_numpy(dtype=bool)
     person = table["person"].to_numpy() if "person" in table else None
     return SmoothedPeople(table["t_ns"].to_numpy(), p, lengths_m, np.asarray(used.any(axis=1)), person)
+
+
+def _read_columns(path: Path, names: Sequence[str]) -> Iterator[Floats]:
+    """Reads columns of numbers (m, k), some rows at a time."""
+    with pq.ParquetFile(path, pre_buffer=False) as file:
+        for batch in file.iter_batches(batch_size=_STRETCH, columns=list(names), use_threads=False):
+            yield np.column_stack([batch.column(name).to_numpy() for name in names])
 
 
 def _smooth(run_config: RunConfig, log: Log, ticks_ns: Ints) -> Iterator[HumanStates]:
@@ -145,9 +155,14 @@ def write_contact(
         second: A second process, which takes every other motion beside the chosen one; None: no such process.
         seen: The bodies that stage 1 saw; None: the log is read again for them.
     """
-    people = read_recorded_people(run_config, log, writer, seen)
-    release_freed_memory()
-    judged = _JudgedRun(run_config, T_world_base, people, writer.partial)
+    with TemporaryDirectory(prefix=".people_", dir=writer.partial) as folder:
+        people = read_recorded_people(run_config, log, writer, seen, Path(folder))
+        release_freed_memory()
+        _judge(_JudgedRun(run_config, T_world_base, people, writer.partial), log, writer, second)
+
+
+def _judge(judged: _JudgedRun, log: Log, writer: RunWriter, second: Executor | None) -> None:
+    """Writes the tables of ``write_contact``."""
     paths = sorted(writer.partial.glob("motion*.parquet"))
     coverages, there = judged.coverages, {}
     if second is not None:
@@ -159,14 +174,11 @@ def write_contact(
     meetings: dict[Path, Columns] = {}
     here = [path for path in paths if path not in there]
     for path in sorted(here, key=lambda path: path.stem == "motion"):  # last, as it needs both coverages
-        motion, capsules = StoredTable(path), None
+        capsules = None
         if path.stem == "motion":
-            shown_ns = motion["t_ns"].to_numpy()[:: max(1, round(run_config.settings.fusion.rate_hz / _BODY_HZ))]
-            for first in range(0, len(shown_ns), _BATCH):
-                some_ns = shown_ns[first : first + _BATCH]
-                writer.table("body", body_table(people, some_ns, run_config.settings.prediction.hand_m))
-        if path.stem == f"motion_{RECORDED}" and motion["q1"].isna().all():
-            capsules, _ = assembly.recorded_capsules(log, T_world_base)
+            _write_body(judged, StoredTable(path)["t_ns"].to_numpy(), writer)
+        if path.stem == f"motion_{RECORDED}" and StoredTable(path)["q1"].isna().all():
+            capsules, _ = assembly.recorded_capsules(log, judged.T_world_base)
         meetings[path] = judged.judge(path, capsules, coverages)
     for path in paths:
         writer.table("severity", meetings[path] if path in meetings else there[path].result())
@@ -174,6 +186,15 @@ def write_contact(
     writer.close_tables()
     if second is not None:
         second.submit(_forget_there)
+
+
+def _write_body(judged: _JudgedRun, ticks_ns: Ints, writer: RunWriter) -> None:
+    """Writes the recorded body at some of the ticks."""
+    settings = judged.run_config.settings
+    shown_ns = ticks_ns[:: max(1, round(settings.fusion.rate_hz / _BODY_HZ))]
+    for first in range(0, len(shown_ns), _BATCH):
+        some_ns = shown_ns[first : first + _BATCH]
+        writer.table("body", body_table(judged.people, some_ns, settings.prediction.hand_m))
 
 
 def _move_rows(path: Path, writer: RunWriter) -> None:
@@ -657,6 +678,6 @@ def deciding_rows(motion: RunTable) -> Ints:
 
     That is the last row before the tick that did not just continue a stop.
     """
-    going_on = motion["status"].astype(str).to_numpy() == "braking"
+    going_on = text_column(motion, "status") == "braking"
     last = np.maximum.accumulate(np.where(going_on, -1, np.arange(len(motion))))
     return np.concatenate([[-1], last])[:-1]

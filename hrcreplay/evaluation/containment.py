@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hrcreplay.evaluation.recorded_person import LIMB_POINTS, RecordedPerson
+from hrcreplay.evaluation.recorded_person import LIMB_POINTS, RecordedPerson, Rows
 from hrcreplay.geometry.distances import farthest_at_most
 from hrcreplay.geometry.inflated_hull import InflatedHull, union_volume_m3
 from hrcreplay.human.prediction.sound_reach import THIGH_M
@@ -28,6 +28,8 @@ AUDIT_HZ = 25.0
 _END = 0.75
 #: Number of sample points for the volume of a tick's union.
 _COUNT = 1024
+#: Number of recorded bodies that are read together.
+_BATCH = 15_000
 #: Rounding of a distance [m].
 _ROUNDING_M = 1e-9
 _NECK, *_SHOULDERS = (POINTS.index(name) for name in ("neck", "shoulder_l", "shoulder_r"))
@@ -74,7 +76,7 @@ class RecordedFuture:
     """The recorded future of some ticks."""
 
     states: HumanStates  #: (n,) the fused person at the ticks
-    recorded: RecordedLimbs  #: the recorded points
+    points_m: Floats  #: (m, 20, 3) the recorded POINTS from the first of these ticks on, world [m]
     first: Ints  #: (n,) row of the first recorded instant after the tick
     last: Ints  #: (n,) row past the last one within the horizon
     seen: dict[str, Bools]  #: limb -> (n, k) True: the point was seen in the last quarter of the horizon
@@ -82,11 +84,15 @@ class RecordedFuture:
     def rows(self, which: slice | Ints) -> RecordedFuture:
         """Selects some of the ticks."""
         seen = {limb: part[which] for limb, part in self.seen.items()}
-        return RecordedFuture(self.states.rows(which), self.recorded, self.first[which], self.last[which], seen)
+        return RecordedFuture(self.states.rows(which), self.points_m, self.first[which], self.last[which], seen)
 
     def of_limb(self, limb: str, tick: int) -> Floats:
-        """(m, k, 3) recorded points of a limb within the horizon of a tick, world [m]."""
-        return self.recorded.points(limb, slice(self.first[tick], self.last[tick]))
+        """(m, k, 3) recorded points of a limb within the horizon of a tick, world [m]; the neck is the model's."""
+        of, whole = _OF_LIMB[limb], self.points_m[self.first[tick] : self.last[tick]]
+        found = np.take(whole, of, axis=1)
+        if _NECK in of:
+            found[:, of.index(_NECK)] = _neck(whole)
+        return found
 
     def checked(self, limb: str) -> Bools:
         """(n,) True if the limb can be checked: both its ends were seen near the horizon's end."""
@@ -104,35 +110,27 @@ class RecordedFuture:
 
 @dataclass(frozen=True)
 class RecordedLimbs:
-    """The recorded points of a person's limbs. Those of a limb are copied when they are asked for, not all at once."""
+    """The recorded points of a person, and how many of them each limb has."""
 
     t_ns: Ints  #: (m,) instants, increasing
-    points_m: Floats  #: (m, 20, 3) POINTS, world [m]; NaN if not recorded or rejected
+    points_m: Rows  #: (m, 20, 3) POINTS, world [m]; NaN if not recorded or rejected
     counts: dict[str, NDArray[np.int32]]  #: limb -> (m + 1, k) number of rows before each that have a point
 
     @classmethod
-    def of(cls, t_ns: Ints, points_m: Floats) -> RecordedLimbs:
+    def of(cls, t_ns: Ints, points_m: Rows) -> RecordedLimbs:
         """Selects the points of each limb.
 
         Args:
             t_ns: (m,) instants, increasing [ns].
             points_m: (m, 20, 3) POINTS of the person, world [m]; NaN if not recorded or rejected.
         """
-        known: Bools = np.asarray(np.isfinite(points_m).all(axis=2))
-        known[:, _NECK] = np.isfinite(_neck(points_m)).all(axis=1)
+        parts = [_known(points_m[first : first + _BATCH]) for first in range(0, len(t_ns), _BATCH)]
+        known = np.concatenate([np.zeros((0, len(POINTS)), dtype=np.bool_), *parts])
         counts = {}
         for limb, of in _OF_LIMB.items():
-            counts[limb] = np.zeros((len(points_m) + 1, len(of)), np.int32)
+            counts[limb] = np.zeros((len(known) + 1, len(of)), np.int32)
             np.cumsum(known[:, of], axis=0, out=counts[limb][1:])
         return cls(t_ns, points_m, counts)
-
-    def points(self, limb: str, rows: slice) -> Floats:
-        """(m, k, 3) points of a limb in some rows; the neck is the model's, the middle of the shoulders."""
-        of, whole = _OF_LIMB[limb], self.points_m[rows]
-        found = np.take(whole, of, axis=1)
-        if _NECK in of:
-            found[:, of.index(_NECK)] = _neck(whole)
-        return found
 
     def future(self, states: HumanStates, horizon_s: float | Floats) -> RecordedFuture:
         """Returns the recorded future (t, t + T] of some ticks.
@@ -146,7 +144,16 @@ class RecordedLimbs:
         last = np.searchsorted(self.t_ns, states.t_ns + horizon_ns, side="right")
         end = np.searchsorted(self.t_ns, states.t_ns + np.round(_END * horizon_ns).astype(np.int64), side="right")
         seen = {limb: np.asarray(count[last] > count[end]) for limb, count in self.counts.items()}
-        return RecordedFuture(states, self, first, last, seen)
+        begin, past = (int(first.min()), int(last.max())) if len(first) else (0, 0)
+        points_m = self.points_m[begin:past]  # once, as a file may have to be read
+        return RecordedFuture(states, points_m, first - begin, last - begin, seen)
+
+
+def _known(points_m: Floats) -> Bools:
+    """(n, 20) whether each point of bodies (n, 20, 3) is known; for the neck, whether both shoulders are."""
+    known: Bools = np.asarray(np.isfinite(points_m).all(axis=2))
+    known[:, _NECK] = np.isfinite(_neck(points_m)).all(axis=1)
+    return known
 
 
 def _neck(points_m: Floats) -> Floats:
@@ -154,7 +161,7 @@ def _neck(points_m: Floats) -> Floats:
     return np.asarray(0.5 * (points_m[:, _SHOULDERS[0]] + points_m[:, _SHOULDERS[1]]))
 
 
-def recorded_future(t_ns: Ints, points_m: Floats, states: HumanStates, horizon_s: float | Floats) -> RecordedFuture:
+def recorded_future(t_ns: Ints, points_m: Rows, states: HumanStates, horizon_s: float | Floats) -> RecordedFuture:
     """Returns the recorded future (t, t + T] of some ticks.
 
     Args:

@@ -7,9 +7,11 @@ prediction for them.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
@@ -30,9 +32,9 @@ from hrcreplay.records import (
     HumanStates,
     Ints,
     Measurements,
-    Table,
     find_neighbours,
 )
+from hrcreplay.store.stored_array import StoredArray
 
 TRUTH, CAMERAS, SMOOTHED = "ground truth", "camera points", "smoothed estimate"
 
@@ -90,15 +92,45 @@ GAP_S = 0.1
 _HOLD_S = 0.02
 
 
+class Rows(Protocol):
+    """An array, or what gives some of its rows when they are asked for."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Its shape; the first axis is that of the rows."""
+
+    def __getitem__(self, rows: slice | Ints, /) -> Floats:
+        """Some of the rows."""
+
+
 @dataclass(frozen=True)
-class SmoothedPeople(Table):
+class SomeRows:
+    """Some rows of an array as an array of their own."""
+
+    every: Rows
+    mine: Ints  #: (n,) the rows
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Number of these rows, and shape of a row."""
+        return len(self.mine), *self.every.shape[1:]
+
+    def __getitem__(self, rows: slice | Ints) -> Floats:
+        return self.every[self.mine[rows]]
+
+
+@dataclass(frozen=True)
+class SmoothedPeople:
     """Joints and lengths of the smoothed people: what is needed of their states here, an eighth of the memory."""
 
     t_ns: Ints  #: (n,)
-    p: Floats  #: (n, 13) JOINTS [m, m, rad..., m]
-    lengths_m: Floats  #: (n, 7) LENGTHS [m]
+    p: Rows  #: (n, 13) JOINTS [m, m, rad..., m]
+    lengths_m: Rows  #: (n, 7) LENGTHS [m]
     used: Bools  #: (n,) whether the update of the tick used a camera
     person: Ints | None = None  #: (n,) number of the person, from 1; None: person 1 in all rows
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
 
     @classmethod
     def of(cls, states: HumanStates) -> SmoothedPeople:
@@ -107,21 +139,24 @@ class SmoothedPeople(Table):
 
     def of_person(self, number: int) -> SmoothedPeople:
         """The rows of one person, as if there were no other."""
-        return self if self.person is None else replace(self.rows(self.person == number), person=None)
+        if self.person is None:
+            return self
+        mine = np.flatnonzero(self.person == number)
+        return SmoothedPeople(self.t_ns[mine], SomeRows(self.p, mine), SomeRows(self.lengths_m, mine), self.used[mine])
 
 
 @dataclass(frozen=True)
 class ModelPoints:
     """The model's points (n, 20, 3) of a person, computed for the rows that are asked for [m]; NaN where not known."""
 
-    p: Floats  #: (n, 13) JOINTS [m, m, rad..., m]
-    lengths_m: Floats  #: (n, 7) LENGTHS [m]
+    p: Rows  #: (n, 13) JOINTS [m, m, rad..., m]
+    lengths_m: Rows  #: (n, 7) LENGTHS [m]
     known: Bools  #: (n,)
 
     @property
     def shape(self) -> tuple[int, ...]:
         """Number of rows, points and coordinates."""
-        return len(self.p), len(POINTS), 3
+        return len(self.known), len(POINTS), 3
 
     def __getitem__(self, rows: slice | Ints) -> Floats:
         """The points of some rows."""
@@ -130,24 +165,14 @@ class ModelPoints:
         return points_m
 
 
-@dataclass(frozen=True)
-class CameraPoints:
+class CameraPoints(SomeRows):
     """The points (n, 20, 3) of a person that one camera shows, among those of all cameras [m]; NaN where not known.
 
     The neck is the middle of the shoulders, if they are known.
     """
 
-    all_m: Floats  #: (m, 20, 3) of all cameras in order of time
-    mine: Ints  #: (n,) rows of this camera
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Number of rows, points and coordinates."""
-        return len(self.mine), *self.all_m.shape[1:]
-
     def __getitem__(self, rows: slice | Ints) -> Floats:
-        """The points of some rows."""
-        return _with_middle_neck(self.all_m[self.mine[rows]])
+        return _with_middle_neck(super().__getitem__(rows))
 
 
 @dataclass(frozen=True)
@@ -156,7 +181,7 @@ class BodyTrack:
 
     source: str  #: TRUTH, SMOOTHED, or a camera; for another body, the camera and the tracker's id
     t_ns: Ints  #: (n,) increasing
-    points_m: Floats | ModelPoints | CameraPoints  #: (n, 20, 3) POINTS, world [m]; NaN if unknown
+    points_m: Rows  #: (n, 20, 3) POINTS, world [m]; NaN if unknown
     hold_s: float = 0.0  #: time around a sample for which a point counts if the neighbouring sample lacks it [s]
 
     @cached_property
@@ -183,7 +208,7 @@ class RecordedPerson:
     number: int  #: from 1
     source: str  #: TRUTH, CAMERAS or SMOOTHED: source of ``points_m``
     t_ns: Ints  #: (m,) instants of the person's recorded points, increasing
-    points_m: Floats  #: (m, 20, 3) POINTS of the person, of all cameras in order of time, world [m]; NaN: rejected
+    points_m: Rows  #: (m, 20, 3) POINTS of the person, of all cameras in order of time, world [m]; NaN: rejected
     tracks: tuple[BodyTrack, ...]  #: only the truth; else the smoothed person and each camera's points
 
 
@@ -224,9 +249,7 @@ class RecordedPeople:
         return np.array([one.number for one in self.people for _ in one.tracks], dtype=np.int64)
 
 
-def at_instants(
-    t_ns: Ints, points_m: Floats | ModelPoints | CameraPoints, at_ns: Ints, gap_s: float, hold_s: float = 0.0
-) -> Floats:
+def at_instants(t_ns: Ints, points_m: Rows, at_ns: Ints, gap_s: float, hold_s: float = 0.0) -> Floats:
     """Interpolates body points at some instants: linear between two samples, or constant for a short time.
 
     Args:
@@ -283,6 +306,7 @@ def read_people(
     fusion_stage: FusionStage,
     smoothed_people: Callable[[], SmoothedPeople],
     bodies: SeenBodies | None = None,
+    folder: Path | None = None,
 ) -> RecordedPeople:
     """Reads all people in a log within a span.
 
@@ -292,20 +316,21 @@ def read_people(
         fusion_stage: Cameras, and settings of stage 1.
         smoothed_people: Returns the smoothed people at these ticks; called for people without ground truth.
         bodies: The bodies that stage 1 saw in the span, which are taken; None: it is run again for them.
+        folder: Folder for files of the people's points, as long as they are needed; None: they stay in memory.
     """
     seen, others = (_see_bodies(log, ticks_ns, fusion_stage) if bodies is None else bodies).take()
-    truth = _truth(log, ticks_ns)
+    truth = _truth(log, ticks_ns, folder)
     of_truth = 1 if truth is None or seen is None else _nearest_to(truth, seen)
     people = []
     if truth is not None:
-        people.append(RecordedPerson(of_truth, TRUTH, truth.t_ns, truth.points_m[:], (truth,)))
+        people.append(RecordedPerson(of_truth, TRUTH, truth.t_ns, truth.points_m, (truth,)))
     rest = [number for number in _numbers(seen) if truth is None or number != of_truth]
     best = smoothed_people() if rest else None
     for number in rest:
         own = best.of_person(number) if best is not None else None
         mine = seen if seen is None or (seen.body == number).all() else seen.rows(seen.body == number)
         if own is not None and mine is not None and number > 1:  # bodies that were not yet a person
-            known = np.isfinite(own.p[:, 0])
+            known = np.isfinite(own.p[:][:, 0])
             since_ns = int(own.t_ns[known][0]) if known.any() else 2**62
             early = mine.capture_ns < since_ns
             others = CameraFrames.join([*([] if others is None else [others]), mine.rows(early)])
@@ -313,7 +338,7 @@ def read_people(
             if not known.any():
                 continue
         if own is not None:
-            people.append(_recorded_person(number, mine, own, fusion_stage))
+            people.append(_recorded_person(number, mine, own, fusion_stage, folder))
     if truth is not None:
         chosen = [] if seen is None else [_renamed(seen.rows(seen.body == of_truth), _CHOSEN)]
         tracks = _people_off(truth, [*chosen, *([] if others is None else [others])], fusion_stage)
@@ -354,21 +379,21 @@ def _nearest_to(truth: BodyTrack, seen: CameraFrames) -> int:
 
 
 def _recorded_person(
-    number: int, seen: CameraFrames | None, best: SmoothedPeople, fusion_stage: FusionStage
+    number: int, seen: CameraFrames | None, best: SmoothedPeople, fusion_stage: FusionStage, folder: Path | None
 ) -> RecordedPerson:
     """A person without ground truth: the smoothed states and the believed points of each camera."""
     smoothed = from_states(best, fusion_stage.filter.memory_s)
     if seen is None or not len(seen):
-        return RecordedPerson(number, SMOOTHED, smoothed.t_ns, smoothed.points_m[:], (smoothed,))
+        return RecordedPerson(number, SMOOTHED, smoothed.t_ns, smoothed.points_m, (smoothed,))
     order = np.argsort(seen.capture_ns, kind="stable")
-    place, t_ns, points_m = np.argsort(order), seen.capture_ns[order], np.empty(seen.points_m.shape)
-    for first in range(0, len(seen), _BATCH):
-        rows = slice(first, first + _BATCH)
-        points_m[place[rows]] = _select_accepted(seen.rows(rows), best, fusion_stage)[0]
-    shown: Bools = np.asarray(np.isfinite(points_m).any(axis=(1, 2)))
+    batches_of = (order[first : first + _BATCH] for first in range(0, len(order), _BATCH))
+    points_m = gather((_select_accepted(seen.rows(rows), best, fusion_stage)[0] for rows in batches_of), folder)
+    parts = (points_m[first : first + _BATCH] for first in range(0, len(order), _BATCH))
+    shown: Bools = np.concatenate([np.isfinite(part).any(axis=(1, 2)) for part in parts])
     if not shown.any():
-        return RecordedPerson(number, SMOOTHED, smoothed.t_ns, _smoothed_points(best), (smoothed,))
-    camera = seen.camera[order]
+        every = ModelPoints(best.p, best.lengths_m, np.ones(len(best), dtype=np.bool_))
+        return RecordedPerson(number, SMOOTHED, smoothed.t_ns, every, (smoothed,))
+    t_ns, camera = seen.capture_ns[order], seen.camera[order]
     cameras = [
         BodyTrack(name, t_ns[mine], CameraPoints(points_m, mine), _HOLD_S)
         for c, name in enumerate(seen.cameras)
@@ -378,16 +403,33 @@ def _recorded_person(
     return RecordedPerson(number, CAMERAS, t_ns, points_m, (smoothed, *cameras))
 
 
-def _truth(log: Log, ticks_ns: Ints) -> BodyTrack | None:
+def gather(parts: Iterable[Floats], folder: Path | None) -> Rows:
+    """The rows of all parts, of which there is one or more, in a file in the folder or, without one, in memory."""
+    if folder is None:
+        return np.concatenate(list(parts))
+    found: StoredArray | None = None
+    for part in parts:
+        found = StoredArray(folder, part.shape[1:]) if found is None else found
+        found.append(part)
+    assert found is not None  # noqa: S101 - for the type checker
+    return found
+
+
+def _truth(log: Log, ticks_ns: Ints, folder: Path | None = None) -> BodyTrack | None:
     """Reads the ground truth within a span; None if the log has none there."""
     if not log.header.has_truth:
         return None
-    truth = [part.rows((part.t_ns >= ticks_ns[0]) & (part.t_ns <= ticks_ns[-1])) for part in log.truth()]
-    truth = [part for part in truth if len(part)]
-    if not truth:
-        return None
-    t_ns = np.concatenate([part.t_ns for part in truth])
-    return BodyTrack(TRUTH, t_ns, np.concatenate([part.points_m for part in truth]))
+    t_ns = [np.zeros(0, np.int64)]
+
+    def parts() -> Iterator[Floats]:
+        yield np.empty((0, len(POINTS), 3))
+        for part in log.truth():
+            here = (part.t_ns >= ticks_ns[0]) & (part.t_ns <= ticks_ns[-1])
+            t_ns.append(part.t_ns[here])
+            yield part.points_m[here]
+
+    points_m = gather(parts(), folder)
+    return BodyTrack(TRUTH, np.concatenate(t_ns), points_m) if points_m.shape[0] else None
 
 
 def _track(source: str, t_ns: Ints, points_m: Floats) -> BodyTrack:
@@ -497,13 +539,13 @@ def read_recordings(
         points, rejected = _select_accepted(mine, own, fusion_stage)
         source, t_ns, points_m = _recorded_points(mine, points, own)
         whole = _plain(log, counts + rejected)
-        found[number] = Recording(states, t_ns, points_m, own.t_ns, own.p, source, whole)
+        found[number] = Recording(states, t_ns, points_m, own.t_ns, own.p[:], source, whole)
     return found
 
 
 def _smoothed_points(best: SmoothedPeople) -> Floats:
     """(n, 20, 3) points of the smoothed person at every tick [m]."""
-    return skeleton(best.p, best.lengths_m)
+    return skeleton(best.p[:], best.lengths_m[:])
 
 
 def _recorded_points(seen: Measurements, points: Floats, best: SmoothedPeople) -> tuple[str, Ints, Floats]:
@@ -558,7 +600,8 @@ def _select_accepted(
     that fails a gate counts as jumping: it is rejected together with the points attached to it.
     """
     tick = np.clip(np.searchsorted(best.t_ns, seen.capture_ns), 0, len(best) - 1)
-    expected = skeleton(best.p[tick], best.lengths_m[tick])
+    lengths_m = best.lengths_m[tick]
+    expected = skeleton(best.p[tick], lengths_m)
     measured: Bools = np.asarray(np.isfinite(seen.points_m).all(axis=2)) & (seen.confidence > 0.0)
     trusted = measured & (seen.confidence >= fusion_stage.filter.confidence_min)
     good, jumped = trusted.copy(), np.zeros_like(trusted)
@@ -569,7 +612,7 @@ def _select_accepted(
     off = np.linalg.norm(points - expected, axis=2)
     for name, start, length, part in _BONES:
         k, j = POINTS.index(name), POINTS.index(start)
-        own = part * best.lengths_m[tick, LENGTHS.index(length)]
+        own = part * lengths_m[:, LENGTHS.index(length)]
         fits = np.abs(np.linalg.norm(points[:, k] - points[:, j], axis=1) - own) <= _BONE_M
         good[:, k] &= (off[:, k] <= fusion_stage.filter.outlier_m) | (fits & good[:, j])
         jumped[:, k] = trusted[:, k] & ~good[:, k] & np.isfinite(off[:, k])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from array import array
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -17,7 +18,7 @@ from hrcreplay.reporting.figures.drawing import BONES
 from hrcreplay.reporting.metrics.contact import StopEvent, method_prefixes, motion_of, stop_events
 from hrcreplay.reporting.metrics.people import named_volumes
 from hrcreplay.reporting.metrics.planning import numeric_column
-from hrcreplay.reporting.metrics.series import seconds_from, times
+from hrcreplay.reporting.metrics.series import columns, seconds_from, times
 from hrcreplay.reporting.robot_description import LinkFrame, link_frames, with_capsules
 from hrcreplay.robot import irb140, irb140_shape
 from hrcreplay.robot.control.control_step import stop_axis_by_axis
@@ -26,7 +27,7 @@ from hrcreplay.robot.irb140_shape import Solid
 from hrcreplay.robot.model import RobotModel, Segment
 from hrcreplay.settings.sections import setting
 from hrcreplay.store.run_folder import Run
-from hrcreplay.store.stored_table import RunTable
+from hrcreplay.store.stored_table import RunTable, number_columns, text_column
 
 #: Rate of the replay [Hz], and the length of a run up to which it is whole; of a longer run the rate is lower [s].
 RATE_HZ, WHOLE_S = 25.0, 600.0
@@ -34,6 +35,8 @@ RATE_HZ, WHOLE_S = 25.0, 600.0
 VOLUME_HZ = 12.5
 #: Maximum age of a row of a table at an instant [s].
 _STALE_S = 0.2
+#: Frames whose skeletons are computed together.
+_TOGETHER = 4096
 #: Shown body points of a fused person.
 SHOWN_POINTS = tuple(dict.fromkeys(name for bone in BONES for name in bone))
 #: Lines between them.
@@ -376,6 +379,22 @@ def _body(body: RunTable | None, parts: tuple[str, ...], at_ns: Ints) -> Floats:
     return _pick(body, names, at_ns).reshape(len(at_ns), len(parts), 2, 3)
 
 
+def shown_skeletons(measurements: RunTable, camera: str) -> Iterator[tuple[int, Floats, int]]:
+    """Yields the skeletons in a camera's frames, by arrival: instant [ns], points (20, 3) [m], number of the person.
+
+    Raises:
+        KeyError: The table has no lengths.
+    """
+    mine = measurements[measurements["camera"] == camera]
+    order = np.argsort(times(mine, "arrival_ns"), kind="stable")
+    t_ns, p, lengths_m = times(mine, "arrival_ns")[order], columns(mine), number_columns(mine, LENGTHS)
+    people = times(mine, "person")[order] if "person" in mine else np.ones(len(mine), np.int64)
+    for first in range(0, len(order), _TOGETHER):
+        rows = order[first : first + _TOGETHER]
+        points_m, part = skeleton(p[rows], lengths_m[rows]), slice(first, first + len(rows))
+        yield from zip(t_ns[part].tolist(), points_m, people[part].tolist(), strict=True)
+
+
 def at_rate(t_ns: Ints, rate_hz: float) -> Ints:
     """Returns the rows of the first stored instant in each period."""
     if not len(t_ns):
@@ -391,19 +410,21 @@ def volume_track(occupancy: RunTable | None) -> VolumeTrack:
     if occupancy is None or not len(occupancy):
         nothing, none = np.zeros(0), np.zeros(0, np.int64)
         return VolumeTrack(none, none, nothing, np.zeros(1, np.int64), np.zeros((0, 3)), nothing, ())
-    limbs = tuple(dict.fromkeys(occupancy["limb"].astype(str)))
-    occupancy = occupancy.iloc[at_rate(times(occupancy), VOLUME_HZ)]
-    counts = np.array([len(flat) // 3 for flat in occupancy["vertices"]], dtype=np.int64)
+    t_ns, (limb, limbs) = times(occupancy), pd.factorize(text_column(occupancy, "limb"))
+    shown, counts, flat = at_rate(t_ns, VOLUME_HZ), [], array("d")
+    for first in range(0, len(shown), _TOGETHER):  # lists of numbers: all of a long run would be in memory three times
+        hulls = occupancy.iloc[shown[first : first + _TOGETHER]]["vertices"].tolist()
+        counts += [len(hull) // 3 for hull in hulls]
+        flat.frombytes(np.concatenate(hulls).tobytes())
+    known = "horizon_s" in occupancy
     return VolumeTrack(
-        t_ns=times(occupancy),
-        limb=np.array([limbs.index(limb) for limb in occupancy["limb"]], dtype=np.int64),
-        radius_m=numeric_column(occupancy, "radius_m"),
+        t_ns=t_ns[shown],
+        limb=limb[shown],
+        radius_m=numeric_column(occupancy, "radius_m")[shown],
         offsets=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
-        vertices_m=np.concatenate(list(occupancy["vertices"])).reshape(-1, 3),
-        horizon_s=numeric_column(occupancy, "horizon_s")
-        if "horizon_s" in occupancy
-        else np.full(len(occupancy), np.nan),
-        limbs=limbs,
+        vertices_m=np.frombuffer(flat).reshape(-1, 3),
+        horizon_s=numeric_column(occupancy, "horizon_s")[shown] if known else np.full(len(shown), np.nan),
+        limbs=tuple(limbs.tolist()),
     )
 
 

@@ -14,17 +14,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from foxglove import messages
 from mcap.writer import CompressionType, Writer
 from scipy.spatial.transform import Rotation
 
 from hrcreplay.geometry.distances import nearest_pair
-from hrcreplay.human.model import skeleton
-from hrcreplay.records import JOINTS, LENGTHS, Bools, Floats
+from hrcreplay.records import LENGTHS, Bools, Floats
 from hrcreplay.reporting import scene_messages as parts
-from hrcreplay.reporting.metrics.series import thin_stretches, times
-from hrcreplay.reporting.replay_scene import LinkMesh, MethodTrack, ReplayScene, at_rate, placements, pose_links
+from hrcreplay.reporting.metrics.series import thin_stretches
+from hrcreplay.reporting.replay_scene import (
+    LinkMesh,
+    MethodTrack,
+    ReplayScene,
+    at_rate,
+    placements,
+    pose_links,
+    shown_skeletons,
+)
 from hrcreplay.reporting.scene_messages import (
     ROBOT,
     WORLD,
@@ -37,6 +43,7 @@ from hrcreplay.reporting.scene_messages import (
     surface,
     timestamp,
 )
+from hrcreplay.store.stored_table import RunTable
 
 #: Maximum rate of volumes [Hz].
 _VOLUME_HZ = 5.0
@@ -74,7 +81,7 @@ def foxglove_layout() -> str:
     return resources.files("hrcreplay.reporting").joinpath("foxglove-layout.json").read_text("utf-8")
 
 
-def write_scene(path: Path, scene: ReplayScene, measurements: pd.DataFrame | None) -> None:
+def write_scene(path: Path, scene: ReplayScene, measurements: RunTable | None) -> None:
     """Writes the scene of a run.
 
     Args:
@@ -354,10 +361,12 @@ def _changes(ends_m: Floats) -> list[bool]:
 
 def _volumes(scene: ReplayScene) -> Iterator[Message]:
     """Yields the stored volumes; without limbs that are not predicted."""
-    stored = scene.volumes.rows(at_rate(scene.volumes.t_ns, _VOLUME_HZ))
-    for t_ns in np.unique(stored.t_ns).tolist():
+    stored = scene.volumes
+    shown = at_rate(stored.t_ns, _VOLUME_HZ)
+    each_ns, first = np.unique(stored.t_ns[shown], return_index=True)
+    for t_ns, rows in zip(each_ns.tolist(), np.split(shown, first)[1:], strict=True):
         entities = []
-        for k in np.flatnonzero(stored.t_ns == t_ns).tolist():
+        for k in rows.tolist():
             hull = stored.vertices_m[stored.offsets[k] : stored.offsets[k + 1]]
             shape = surface(hull, float(stored.radius_m[k]))
             entities.append(entity(t_ns, f"volume {stored.limbs[stored.limb[k]]}", triangles=[shape]))
@@ -394,18 +403,15 @@ def _series(scene: ReplayScene, name: str, track: MethodTrack) -> Iterator[Messa
         yield topic, t_ns, json.dumps(row, sort_keys=True, separators=(",", ":")).encode()
 
 
-def _cameras(measurements: pd.DataFrame | None) -> list[Iterator[Message]]:
+def _cameras(measurements: RunTable | None) -> list[Iterator[Message]]:
     """Yields the skeletons in each camera's frames, by arrival, one stream per camera."""
     if measurements is None or not set(LENGTHS) <= set(measurements.columns):
         return []
-    return [_camera(str(camera), rows) for camera, rows in measurements.groupby("camera", sort=True)]
+    return [_camera(measurements, camera) for camera in sorted(measurements["camera"].unique())]
 
 
-def _camera(camera: str, rows: pd.DataFrame) -> Iterator[Message]:
-    rows = rows.sort_values("arrival_ns", kind="stable")
-    at = np.round(skeleton(rows[list(JOINTS)].to_numpy(dtype=float), rows[list(LENGTHS)].to_numpy(dtype=float)), 3)
-    people = rows["person"].tolist() if "person" in rows else [1] * len(rows)
-    for t_ns, found, number in zip(times(rows, "arrival_ns").tolist(), at, people, strict=True):
+def _camera(measurements: RunTable, camera: str) -> Iterator[Message]:
+    for t_ns, found, number in shown_skeletons(measurements, camera):
         name = f"camera {camera}" if number == 1 else f"camera {camera}, person {number}"
-        shown = entity(t_ns, name, lines=[bones(found, _CAMERA)])
+        shown = entity(t_ns, name, lines=[bones(np.round(found, 3), _CAMERA)])
         yield f"/camera/{camera}", t_ns, messages.SceneUpdate(entities=[shown])

@@ -11,17 +11,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from hrcreplay.errors import SettingsError
 from hrcreplay.geometry.distances import nearest_pair
-from hrcreplay.human.model import skeleton
-from hrcreplay.records import JOINTS, LENGTHS, POINTS, Floats
+from hrcreplay.records import LENGTHS, POINTS, Floats
 from hrcreplay.reporting.figures.drawing import BONES
-from hrcreplay.reporting.metrics.series import thin_stretches, times
-from hrcreplay.reporting.replay_scene import MethodTrack, ReplayScene, at_rate, placements, pose_links
+from hrcreplay.reporting.metrics.series import thin_stretches
+from hrcreplay.reporting.replay_scene import (
+    MethodTrack,
+    ReplayScene,
+    at_rate,
+    placements,
+    pose_links,
+    shown_skeletons,
+)
 from hrcreplay.reporting.scene_messages import surface_mesh, upright_to, whole_surface
 from hrcreplay.reporting.tables import part_name_text
+from hrcreplay.store.stored_table import RunTable
 
 try:
     import rerun as rr
@@ -42,7 +48,7 @@ _VIEW_DEPTH_M = 0.35
 _PAIRS = np.array([[POINTS.index(a), POINTS.index(b)] for a, b in BONES])
 
 
-def write_scene(path: Path, scene: ReplayScene, measurements: pd.DataFrame | None, name: str) -> None:
+def write_scene(path: Path, scene: ReplayScene, measurements: RunTable | None, name: str) -> None:
     """Writes the scene of a run.
 
     Args:
@@ -285,15 +291,12 @@ def _log_distance(recording: Any, scene: ReplayScene) -> None:
     recording.send_columns("world/distance", indexes=[_at(scene, known)], columns=columns)
 
 
-def _log_seen(recording: Any, scene: ReplayScene, measurements: pd.DataFrame | None) -> None:
+def _log_seen(recording: Any, scene: ReplayScene, measurements: RunTable | None) -> None:
     """Logs the skeletons in each camera's frames, by arrival."""
     if measurements is None or not set(LENGTHS) <= set(measurements.columns):
         return
-    for camera, rows in measurements.groupby("camera", sort=True):
-        rows = rows.sort_values("arrival_ns", kind="stable")
-        at = skeleton(rows[list(JOINTS)].to_numpy(dtype=float), rows[list(LENGTHS)].to_numpy(dtype=float))
-        people = rows["person"].tolist() if "person" in rows else [1] * len(rows)
-        for t_ns, points, number in zip(times(rows, "arrival_ns").tolist(), at, people, strict=True):
+    for camera in sorted(measurements["camera"].unique()):
+        for t_ns, points, number in shown_skeletons(measurements, camera):
             lines = points[_PAIRS]
             lines = lines[np.isfinite(lines).all(axis=(1, 2))]
             recording.set_time(TIMELINE, duration=(t_ns - scene.t0_ns) * 1e-9)

@@ -244,7 +244,7 @@ class Run:
     folder: Path
     meta: dict[str, Any]
     state: RunTable | None = None
-    measurements: pd.DataFrame | None = None
+    measurements: RunTable | None = None
     truth: pd.DataFrame | None = None
     bodies: pd.DataFrame | None = None
     agreement: pd.DataFrame | None = None
@@ -340,7 +340,7 @@ def read(folder: Path, meta: dict[str, Any] | None = None) -> Run:
         folder=folder,
         meta=meta,
         state=stored("state"),
-        measurements=whole("measurements"),
+        measurements=stored("measurements"),
         truth=whole("truth"),
         bodies=whole("bodies"),
         agreement=whole("agreement"),

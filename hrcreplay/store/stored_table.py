@@ -6,14 +6,15 @@ from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Self, overload
+from typing import Any, ClassVar, Self, overload
+from weakref import WeakValueDictionary
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from hrcreplay.records import Bools, Ints
+from hrcreplay.records import Bools, Floats, Ints
 
 #: An array of any type.
 Anything = np.ndarray[tuple[int, ...], np.dtype[Any]]
@@ -46,7 +47,7 @@ class StoredTable:
             rows: (n,) True for the rows of the file that belong to the table; None: all.
             made: Column beside those of the file, or in place of one -> (n,) its values in the rows of the table.
         """
-        self._file = path if isinstance(path, _File) else _File(path)
+        self._file = path if isinstance(path, _File) else _File.of(path)
         self._rows, self._made = rows, dict(made or {})
         self.columns = self._file.names if columns is None else tuple(columns)
 
@@ -130,6 +131,18 @@ class StoredTable:
 class _File:
     """A parquet file, and the columns that were read last."""
 
+    _open: ClassVar[WeakValueDictionary[tuple[str, int, int, int], _File]] = WeakValueDictionary()
+
+    @classmethod
+    def of(cls, path: Path) -> _File:
+        """The file; tables opened apart share it, as its description alone takes 70 MB for an hour of states."""
+        about = path.stat()
+        key = str(path), about.st_ino, about.st_size, about.st_mtime_ns
+        found = cls._open.get(key)
+        if found is None:
+            found = cls._open[key] = cls(path)
+        return found
+
     def __init__(self, path: Path) -> None:
         self._path = path
         self._kept: OrderedDict[str, pd.Series[Any]] = OrderedDict()
@@ -190,3 +203,21 @@ class _Places:
 
 #: A table of a run: in its folder, or in memory.
 RunTable = pd.DataFrame | StoredTable
+
+
+def number_columns(table: RunTable, names: Sequence[str]) -> Floats:
+    """Returns columns of numbers (n, len(names)); read one after the other, as in a table of their own they are twice.
+
+    Raises:
+        KeyError: There is no such column.
+    """
+    found = np.empty((len(table), len(names)), order="F")
+    for k, name in enumerate(names):
+        found[:, k] = table[name]
+    return found
+
+
+def text_column(table: RunTable, name: str) -> Anything:
+    """Returns a column of texts (n,), "" where there is none; equal texts are one object, each is in memory once."""
+    index, known = pd.factorize(table[name])
+    return np.append(np.asarray(known, dtype=object), "")[index]

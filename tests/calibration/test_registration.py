@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from hrcreplay.calibration import registration
 from hrcreplay.calibration.registration import (
     Registration,
     disagreement,
@@ -155,3 +156,27 @@ def test_register_on_real_movement(name: str) -> None:
     assert rest is not None
     assert 0.017 < rest.median_m < 0.036  # as real pairs disagree
     np.testing.assert_allclose(transform(np.eye(4), b.points_m), b.points_m)
+
+
+def test_a_marker_that_jumps_counts_nowhere_in_a_track(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frame by frame beside the same in batches that end within the track."""
+    rng, n = np.random.default_rng(4), 200
+    points = np.cumsum(rng.normal(scale=0.002, size=(n, len(POINTS), 3)), axis=0)
+    far, gone = rng.random((n, len(POINTS))) < 0.05, rng.random((n, len(POINTS))) < 0.1
+    points[far] += 0.4
+    points[gone] = np.nan
+    track = SkeletonTrack(np.arange(n) * 33_000_000, points, np.where(rng.random(gone.shape) < 0.05, 0.0, 0.9))
+    monkeypatch.setattr(registration, "_BATCH", 7)
+    found = registration._without_jumps(track)
+    removed = 0
+    for i in range(n):
+        near = [min(max(i + k, 0), n - 1) for k in range(-2, 3)]
+        for k in range(len(POINTS)):
+            seen = [j for j in near if np.isfinite(points[j, k, 0]) and track.confidence[j, k] > 0.0]
+            own = points[i, k] if i in seen else np.zeros(3)
+            middle = np.median([points[j, k] if j in seen else own for j in near], axis=0)
+            counts = i in seen and np.linalg.norm(own - middle) <= 0.15
+            removed += i in seen and not counts
+            assert found.confidence[i, k] == (track.confidence[i, k] if counts else 0.0)
+            np.testing.assert_array_equal(found.points_m[i, k], own)
+    assert removed > 20

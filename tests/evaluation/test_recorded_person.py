@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,12 +14,16 @@ import pytest
 
 from hrcreplay.commands import replay
 from hrcreplay.commands.report import summary
+from hrcreplay.evaluation import recorded_person
+from hrcreplay.evaluation.contact import read_recorded_people
 from hrcreplay.evaluation.recorded_person import CameraPoints
 from hrcreplay.geometry.distances import segment_distance
 from hrcreplay.logs.reader import open_log
 from hrcreplay.logs.writer import LogWriter
+from hrcreplay.pipeline.run_config import resolve
 from hrcreplay.records import POINTS, CameraFrames, Floats
 from hrcreplay.robot.model import irb140
+from hrcreplay.store.run_folder import RunWriter
 from tests.coverage_figures import assert_one_coverage
 from tests.facts import tells
 from tests.undrawn import undrawn
@@ -207,3 +212,38 @@ def test_the_points_of_a_camera_are_its_rows_with_the_neck_between_the_shoulders
                 expected[neck] = 0.5 * (before[row, left] + before[row, right])
             np.testing.assert_array_equal(found, expected)
     np.testing.assert_array_equal(all_m, before)
+
+
+@pytest.mark.parametrize("truth", [False, True])
+def test_people_are_the_same_from_files_and_in_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, truth: bool
+) -> None:
+    """Two people, in batches that end within the recording; the files hold what is large."""
+    monkeypatch.setattr(recorded_person, "_BATCH", 37)
+    ran = replay.run("fuse", rewritten(tmp_path / "log.mcap", bystander=True, truth=truth), out=tmp_path / "run")
+    run_config, kept = resolve("report", ran), tmp_path / "kept"
+    log = open_log(run_config.log, run_config.settings.logs)
+    kept.mkdir()
+    writer = RunWriter(ran)
+    monkeypatch.setattr(RunWriter, "partial", property(lambda writer: writer.folder))
+    plain, stored = (
+        read_recorded_people(run_config, log, writer),
+        read_recorded_people(run_config, log, writer, folder=kept),
+    )
+    assert [one.number for one in plain.people] == [one.number for one in stored.people] == [1, 2]
+    assert plain.names == stored.names
+    for one, other in zip(plain.people, stored.people, strict=True):
+        assert one.source == other.source
+        np.testing.assert_array_equal(one.t_ns, other.t_ns)
+        np.testing.assert_array_equal(one.points_m[:], other.points_m[:])
+    for track, again in zip(plain.tracks, stored.tracks, strict=True):
+        np.testing.assert_array_equal(track.t_ns, again.t_ns)
+        np.testing.assert_array_equal(track.points_m[:], again.points_m[:])
+    in_files = sum(path.stat().st_size for path in kept.iterdir())
+    assert in_files >= sum(8 * one.points_m[:].size for one in stored.people)
+    assert len(pickle.dumps(stored)) < 0.2 * len(pickle.dumps(plain))
+
+
+def test_a_report_leaves_no_file_of_the_people(beside: Path, tmp_path: Path) -> None:
+    reported(beside, tmp_path / "run", *BLIND)
+    assert [path.name for path in (tmp_path / "run").iterdir() if path.name.startswith(".")] == []

@@ -85,7 +85,7 @@ def test_fused_rmse_while_the_person_is_seen(run: Run) -> None:
 def test_camera_rmse_and_ratio(run: Run, found: dict[str, dict[str, Any]]) -> None:
     assert run.measurements is not None
     pooled = {}
-    for camera, rows in run.measurements.groupby("camera"):
+    for camera, rows in frame_of(run.measurements).groupby("camera"):
         squares = []
         for joint in ANGLES:
             for t, value in zip(rows["capture_ns"], rows[joint], strict=True):

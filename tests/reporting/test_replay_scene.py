@@ -11,15 +11,22 @@ import pytest
 from scipy.linalg import expm
 
 from hrcreplay.human.model import skeleton
-from hrcreplay.records import LIMBS, POINTS, Floats
+from hrcreplay.records import JOINTS, LENGTHS, LIMBS, POINTS, Floats
 from hrcreplay.reporting import replay_scene
 from hrcreplay.reporting.metrics.contact import stop_events
 from hrcreplay.reporting.page.replay_page import MISSING, NumberBlock, replay_data
-from hrcreplay.reporting.replay_scene import SHOWN_POINTS, ReplayScene
+from hrcreplay.reporting.replay_scene import (
+    SHOWN_POINTS,
+    VOLUME_HZ,
+    ReplayScene,
+    at_rate,
+    shown_skeletons,
+    volume_track,
+)
 from hrcreplay.robot.control.control_step import stop_axis_by_axis, stop_straight
 from hrcreplay.robot.control.static_obstacles import StaticHull
 from tests.reporting.moving import joints, moving_run, moving_scene, robot
-from tests.reporting.synthetic import LENGTHS_M, T0_NS, pose
+from tests.reporting.synthetic import LENGTHS_M, T0_NS, frame_of, pose
 
 
 @pytest.fixture(scope="module")
@@ -192,3 +199,27 @@ def test_the_page_has_the_surfaces_of_objects(scene: ReplayScene) -> None:
     assert sorted(set(shown["triangles"])) == list(range(8))
     assert len(shown["triangles"]) == 36
     assert "objects" not in json.loads(replay_data(scene)[0])
+
+
+def test_volumes_and_skeletons_are_the_same_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beside those of the tables, row by row; parts end within a table."""
+    run = moving_run(4.0)
+    assert run.occupancy is not None
+    assert run.measurements is not None
+    monkeypatch.setattr(replay_scene, "_TOGETHER", 11)
+    occupancy = frame_of(run.occupancy)
+    track, shown = volume_track(occupancy), occupancy.iloc[at_rate(occupancy["t_ns"].to_numpy(), VOLUME_HZ)]
+    assert len(track.t_ns) == len(shown) > 11
+    for i, (_, row) in enumerate(shown.iterrows()):
+        assert (track.t_ns[i], track.limbs[track.limb[i]], track.radius_m[i]) == (row.t_ns, row.limb, row.radius_m)
+        hull = track.vertices_m[track.offsets[i] : track.offsets[i + 1]]
+        np.testing.assert_array_equal(hull, np.reshape(row.vertices, (-1, 3)))
+    late = frame_of(run.measurements).iloc[::-1]  # by arrival, in whatever order they are stored
+    for camera in sorted(set(late["camera"])):
+        rows = late[late["camera"] == camera].sort_values("arrival_ns", kind="stable")
+        found = list(shown_skeletons(late, camera))
+        assert [t_ns for t_ns, _, _ in found] == rows["arrival_ns"].tolist()
+        assert {number for _, _, number in found} == {1}
+        want = skeleton(rows[list(JOINTS)].to_numpy(dtype=float), rows[list(LENGTHS)].to_numpy(dtype=float))
+        np.testing.assert_array_equal(np.array([points for _, points, _ in found]), want)
+        assert len(found) > 11

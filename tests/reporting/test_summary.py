@@ -37,7 +37,7 @@ def test_fuse(run: Run) -> None:
     run = dataclasses.replace(run, state=run.state.assign(frame_age_s=age_s, unseen_LEGS=unseen_s, unseen_HD=age_s))
     run.meta["settings"]["fusion"]["fresh_s"] = 0.3
     assert run.measurements is not None
-    frames = run.measurements.groupby("camera").size()
+    frames = frame_of(run.measurements).groupby("camera").size()
     said = _lines(run)["fuse"]
     assert tells(said, "1,200 ticks", "75.0 % (LEGS 50.0 %)", "1,234 outlier points")
     assert tells(said, f"kinect {frames['kinect']}", f"xtion {frames['xtion']}")

@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from hrcreplay.store import stored_table
-from hrcreplay.store.stored_table import RunTable, StoredTable
+from hrcreplay.store.stored_table import RunTable, StoredTable, number_columns, text_column
 
 N, GROUP = 1000, 64
 
@@ -112,3 +112,34 @@ def test_it_keeps_no_more_of_a_file_than_it_may(
         pd.testing.assert_series_equal(stored[name], frame[name])
         assert sum(column.nbytes for column in stored._file._kept.values()) <= 2 * 8 * N or len(stored._file._kept) == 1
     assert list(stored._file._kept) == ["person", "t_ns"]
+
+
+def test_tables_of_one_file_share_it_and_one_written_anew_is_read_anew(tmp_path: Path) -> None:
+    path = tmp_path / "table.parquet"
+    pq.write_table(pa.table({"t_ns": np.arange(5)}), path)
+    one, other = StoredTable(path), StoredTable(path)
+    assert one._file is other._file
+    before = one["t_ns"].tolist()
+    path.unlink()
+    pq.write_table(pa.table({"t_ns": np.arange(7)}), path)
+    assert StoredTable(path)["t_ns"].tolist() == list(range(7)) != before
+
+
+def test_columns_of_numbers_are_those_of_the_table(tables: tuple[StoredTable, pd.DataFrame]) -> None:
+    stored, frame = tables
+    names = ["distance_m", "t_ns"]
+    for table in (stored, frame):
+        found = number_columns(table, names)
+        np.testing.assert_array_equal(found, frame[names].to_numpy(dtype=float))
+        assert found.flags.f_contiguous, "as pandas has them: sums of rows depend on it"
+    with pytest.raises(KeyError, match="link"):
+        number_columns(stored, ["link"])
+
+
+def test_a_column_of_texts_has_each_text_once(tables: tuple[StoredTable, pd.DataFrame]) -> None:
+    stored, frame = tables
+    want = ["" if pd.isna(limb) else limb for limb in frame["limb"]]
+    for table in (stored, frame):
+        found = text_column(table, "limb")
+        assert found.tolist() == want
+        assert len({id(text) for text in found}) == 3

@@ -13,7 +13,7 @@ from matplotlib.ticker import MaxNLocator
 
 from hrcreplay.records import JOINTS, Bools, Floats, Ints
 from hrcreplay.reporting.figures import drawing
-from hrcreplay.reporting.metrics.fusion import cameras, errors, seconds_since
+from hrcreplay.reporting.metrics.fusion import cameras, errors, frames_of, seconds_since
 from hrcreplay.reporting.metrics.series import (
     ANGLES,
     Metric,
@@ -94,9 +94,7 @@ def _frames(run: Run) -> dict[str, RunTable]:
     table = run.measurements
     if table is None:
         return {}
-    ordered = table.sort_values("capture_ns", kind="stable")
-    of = ordered["camera"].astype(str).to_numpy()
-    return {camera: ordered[of == camera] for camera in cameras(run)}
+    return {camera: frames_of(table, camera) for camera in cameras(run)}
 
 
 def _seen(run: Run, frames: RunTable, joint: str, t0_ns: int, gap_s: float) -> tuple[Floats, Floats]:

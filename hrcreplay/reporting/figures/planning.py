@@ -73,12 +73,12 @@ def path(
     limbs = _limbs_at(occupancy, motion, worst)
     figure = drawing.column_figure(2.45)
     (above, side), *_ = drawing.column_panels(figure, 1, 2, bottom_in=0.62)
-    shown = np.vstack([position_columns(motion, "ref"), position_columns(motion, "tcp")])
+    shown = [position_columns(motion, "ref"), position_columns(motion, "tcp")]
     if T_world_base is not None:
-        shown = np.vstack([shown, T_world_base[:3, 3]])
+        shown.append(T_world_base[None, :3, 3])
     for ax, view in ((above, ABOVE), (side, SIDE)):
         _draw_path(ax, view, motion, limbs, worst)
-        low, high = bounds_of([view.flat(shown)], 0.08)
+        low, high = bounds_of([view.flat(points) for points in shown], 0.08)
         drawing.set_window(ax, low.tolist(), high.tolist())
         if T_world_base is not None:
             ax.plot(*view.flat(T_world_base[None, :3, 3]).T, "s", color=drawing.INK, ms=4, zorder=3)

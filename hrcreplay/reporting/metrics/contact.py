@@ -19,7 +19,7 @@ from hrcreplay.reporting.metrics.planning import is_moving, method_text, numeric
 from hrcreplay.reporting.metrics.series import MetricTable, durations_s, times
 from hrcreplay.settings.sections import setting
 from hrcreplay.store.run_folder import Run
-from hrcreplay.store.stored_table import RunTable
+from hrcreplay.store.stored_table import RunTable, text_column
 
 #: Source of the recorded person, as in contact.parquet, and in words.
 PERSONS = {
@@ -132,7 +132,7 @@ def _is_whole(body: RunTable, part: str) -> Bools:
 
 def _add_stops(metrics: MetricTable, prefix: str, motion: RunTable, what: str, slow: float) -> None:
     """Adds full stops, ticks without a certificate, horizons, and reasons for standing without braking."""
-    status, moving = motion["status"].astype(str).to_numpy(), is_moving(motion, slow)
+    status, moving = text_column(motion, "status"), is_moving(motion, slow)
     stops = (status == "braking") & moving
     metrics.add(
         f"{prefix}_full_stop_share",
@@ -161,7 +161,7 @@ def _add_stops(metrics: MetricTable, prefix: str, motion: RunTable, what: str, s
             f"{kind} over all ticks of {what}: horizon of the prediction",
             reason="the table of motion does not contain it",
         )
-    reasons = motion["reason"].fillna("").astype(str).to_numpy()
+    reasons = text_column(motion, "reason")
     for reason in sorted(set(reasons[status != "braking"]) - {""}):
         slug = "_".join("".join(c if c.isalnum() else " " for c in reason.lower()).split())
         share = float(((reasons == reason) & (status != "braking")).mean())
@@ -258,7 +258,7 @@ def _least(distance: Floats, which: Bools) -> int | None:
 def retreats(motion: RunTable, t_ns: Ints) -> Bools:
     """Marks the ticks (n,) at which the motion was a retreat, or the stop of one."""
     decided = deciding_rows(motion)[np.searchsorted(times(motion), t_ns)]
-    return np.asarray((decided >= 0) & (motion["status"].astype(str).to_numpy()[decided] == "retreating"))
+    return np.asarray((decided >= 0) & (text_column(motion, "status")[decided] == "retreating"))
 
 
 def _add_faults(metrics: MetricTable, prefix: str, rows: RunTable, what: str, motion: RunTable, *, blind: str) -> None:
@@ -370,7 +370,7 @@ def stop_events(motion: RunTable, contact: RunTable | None, t0_ns: int, slow_m_p
 def _stops(motion: RunTable, t0_ns: int, slow: float) -> list[StopEvent]:
     t_ns, lasts_s = times(motion), durations_s(times(motion))
     moving = is_moving(motion, slow)
-    braking = motion["status"].astype(str).to_numpy() == "braking"
+    braking = text_column(motion, "status") == "braking"
     speed, distance = (numeric_column(motion, name) for name in ("tcp_speed", "distance_m"))
     stopping, names = braking & moving, _names(motion)
     found = []

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 
 from hrcreplay.records import BODY, JOINTS, LIMBS, Bools, Floats, Ints
 from hrcreplay.reporting.metrics.series import (
@@ -33,7 +34,7 @@ def cameras(run: Run) -> list[str]:
     """Names of the run's cameras, sorted."""
     found: set[str] = set()
     if run.measurements is not None:
-        found |= set(run.measurements["camera"].astype(str))
+        found |= set(run.measurements["camera"].unique())
     if run.state is not None:
         found |= {name.removeprefix("valid_") for name in run.state.columns if name.startswith("valid_")}
     return sorted(found)
@@ -291,7 +292,7 @@ def errors(run: Run, gap_s: float) -> dict[str, Errors]:
         )
     if run.measurements is not None:
         for camera in cameras(run):
-            rows = run.measurements[run.measurements["camera"] == camera].sort_values("capture_ns", kind="stable")
+            rows = frames_of(run.measurements, camera)
             at_ns, raw = times(rows, "capture_ns"), columns(rows)
             step_ns = np.diff(at_ns)
             kept = (step_ns > 0) & (step_ns * 1e-9 <= gap_s)
@@ -304,6 +305,12 @@ def errors(run: Run, gap_s: float) -> dict[str, Errors]:
                 raw_rate - interpolate(truth_ns, rate, middle_ns, angles=False),
             )
     return found
+
+
+def frames_of(measurements: RunTable, camera: str) -> pd.DataFrame:
+    """Returns capture times and joints in a camera's frames, in order of capture."""
+    mine = measurements[measurements["camera"] == camera]
+    return mine[["capture_ns", *JOINTS]].sort_values("capture_ns", kind="stable")
 
 
 def rmse(error: Floats) -> float | None:

@@ -18,7 +18,7 @@ from hrcreplay.geometry.polyline import advance_foot
 from hrcreplay.records import RECORDED, STATUSES, Bools, Floats, Ints
 from hrcreplay.reporting.metrics.series import MetricTable, durations_s, path_feet, times
 from hrcreplay.robot.recorded import UNKNOWN
-from hrcreplay.store.stored_table import RunTable
+from hrcreplay.store.stored_table import RunTable, number_columns, text_column
 
 #: Shorter distances are rounding [m].
 _ROUNDING_M = 1e-9
@@ -114,7 +114,7 @@ PAPER = {
 
 def position_columns(motion: RunTable, what: str) -> Floats:
     """Returns (n, 3) ``ref`` or ``tcp`` positions, world [m]."""
-    return motion[[f"{what}_x", f"{what}_y", f"{what}_z"]].to_numpy(dtype=float)
+    return number_columns(motion, [f"{what}_{axis}" for axis in "xyz"])
 
 
 def numeric_column(motion: RunTable, name: str) -> Floats:
@@ -137,9 +137,11 @@ def stationary(motion: RunTable, near_m: float, stationary_m_per_s: float) -> tu
 
 def is_moving(motion: RunTable, slow_m_per_s: float) -> Bools:
     """(n,) True if the robot moves: its TCP, or any joint at 1 mrad/s, as links can move while the TCP stands."""
-    joints = [name for name in motion.columns if name.startswith("dq")]
-    turning = (np.abs(motion[joints].to_numpy(dtype=float)) >= 1e-3).any(axis=1)
-    return np.asarray((numeric_column(motion, "tcp_speed") >= slow_m_per_s) | turning)
+    moving = numeric_column(motion, "tcp_speed") >= slow_m_per_s
+    for name in motion.columns:
+        if name.startswith("dq"):
+            moving |= np.abs(numeric_column(motion, name)) >= 1e-3
+    return np.asarray(moving)
 
 
 def deviation_m(motion: RunTable) -> Floats:
@@ -223,7 +225,7 @@ def _add_recorded(metrics: MetricTable, motion: RunTable, contact: RunTable | No
     what, known = method_text(RECORDED), np.isfinite(numeric_column(motion, "tcp_x"))
     metrics.add("recorded_ticks", len(motion), "1", f"ticks of {what}, known or not")
     metrics.add("recorded_known_ticks", int(known.sum()), "1", f"ticks of {what} at which it is known")
-    reasons = motion["reason"].astype(str).to_numpy()
+    reasons = text_column(motion, "reason")
     for reason in UNKNOWN[1:]:
         count = int((reasons[~known] == reason).sum())
         metrics.add(
@@ -253,7 +255,7 @@ def _slug(reason: str) -> str:
 
 
 def _add_status(metrics: MetricTable, prefix: str, motion: RunTable, what: str, slow: float) -> None:
-    status = motion["status"].astype(str).to_numpy()
+    status = text_column(motion, "status")
     moving = is_moving(motion, slow)
     braking = status == "braking"
     metrics.add(f"{prefix}_ticks", len(motion), "1", f"ticks of {what}")
@@ -269,7 +271,7 @@ def _add_status(metrics: MetricTable, prefix: str, motion: RunTable, what: str, 
         "certified to bring no point of the link nearer to any point of the volume, not to be clear of it",
         reason="the table of motion does not contain it" if (status == "retreating").any() else "it never retreated",
     )
-    reasons = motion["reason"].astype(str).to_numpy()
+    reasons = text_column(motion, "reason")
     for reason in sorted(set(reasons[braking])):
         count = int((reasons[braking] == reason).sum())
         slug = _slug(reason) or "unnamed"

@@ -14,7 +14,7 @@ from hrcreplay.geometry.polyline import follow_nearer, nearest_vertices
 from hrcreplay.human.model import nearest
 from hrcreplay.records import JOINTS, Bools, Floats, Ints, find_neighbours
 from hrcreplay.store.run_folder import Run
-from hrcreplay.store.stored_table import RunTable
+from hrcreplay.store.stored_table import RunTable, number_columns
 
 Metric = dict[str, Any]
 
@@ -68,7 +68,7 @@ def difference(a: Floats, b: Floats) -> Floats:
 
 def columns(table: RunTable, suffix: str = "") -> Floats:
     """Returns the (n, 13) columns of the JOINTS with a suffix."""
-    return table[[joint + suffix for joint in JOINTS]].to_numpy(dtype=float)
+    return number_columns(table, [joint + suffix for joint in JOINTS])
 
 
 def times(table: RunTable, name: str = "t_ns") -> Ints:
@@ -247,7 +247,10 @@ def find_known_ticks(run: Run) -> Ints:
     """Returns the ticks at which the person is known [ns]."""
     if run.state is None:
         return np.zeros(0, dtype=np.int64)
-    return times(run.state)[np.isfinite(columns(run.state)).all(axis=1)]
+    known = np.ones(len(run.state), dtype=np.bool_)
+    for joint in JOINTS:
+        known &= np.isfinite(run.state[joint].to_numpy(dtype=float))
+    return times(run.state)[known]
 
 
 def moment_ns(run: Run) -> int | None:
