@@ -42,6 +42,7 @@ from hrcreplay.reporting.tables import PageTable
 from hrcreplay.reporting.tour import telling_moment, tour
 from hrcreplay.settings.sections import Logs, setting
 from hrcreplay.store import run_folder
+from hrcreplay.store.memory import release_freed_memory
 from hrcreplay.store.run_folder import Run, RunWriter
 
 #: Key of ``--figure`` for all figures for which a run has the data.
@@ -72,8 +73,10 @@ def write_report(
     there = None if second is None else (second, second.submit(_write_scene, run_config, writer.partial, meta))
     everybody = run_folder.read(writer.partial, meta)
     found = compute(everybody, **near)
+    release_freed_memory()
     run = everybody.of_person(everybody.people[0])
     stops = _stops(run_config, log, run, near["stationary_m_per_s"], found) if log else ()
+    release_freed_memory()
     writer.text("metrics.json", run_folder.to_json(found))
     prediction_stage = assembly.prediction_stage(run_config)
     prediction = prediction_stage.settings
@@ -85,6 +88,7 @@ def write_report(
     kinds = catalogue.select_figures(run, found)
     here = None if there is not None else writer.partial / "scene.mcap"
     replay = _make_replay(run_config, everybody, here)
+    release_freed_memory()
     _draw_figures(run_config, everybody, found, kinds, folder, progress=progress, second=there)
     progress.begin("page")
     shown = [
@@ -107,6 +111,7 @@ def _make_replay(run_config: RunConfig, run: Run, path: Path | None) -> ReplayPa
     scene = scene_of(run_config, run)
     if scene is not None and path is not None:
         write_scene(path, scene, run.measurements)
+    release_freed_memory()
     return None if scene is None else replay_part(scene)
 
 
@@ -114,6 +119,7 @@ def _write_scene(run_config: RunConfig, folder: Path, meta: dict[str, Any]) -> N
     """Writes scene.mcap in the second process."""
     everybody = _tables(folder, json.dumps(meta))
     scene = scene_of(run_config, everybody)
+    release_freed_memory()
     if scene is not None:
         write_scene(folder / "scene.mcap", scene, everybody.measurements)
 

@@ -31,8 +31,8 @@ from hrcreplay.store.stored_table import RunTable, number_columns, text_column
 
 #: Rate of the replay [Hz], and the length of a run up to which it is whole; of a longer run the rate is lower [s].
 RATE_HZ, WHOLE_S = 25.0, 600.0
-#: Maximum rate of volumes in the replay [Hz].
-VOLUME_HZ = 12.5
+#: Maximum rate of volumes in the replay [Hz], and that of a longer run.
+VOLUME_HZ, LONG_VOLUME_HZ = 12.5, 5.0
 #: Maximum age of a row of a table at an instant [s].
 _STALE_S = 0.2
 #: Frames whose skeletons are computed together.
@@ -133,6 +133,7 @@ class VolumeTrack:
     vertices_m: Floats  #: (m, 3) world
     horizon_s: Floats  #: (k,) horizon after the instant; NaN if the table has no value
     limbs: tuple[str, ...]
+    rate_hz: float  #: maximum number of instants a second
 
     def rows(self, which: Ints) -> VolumeTrack:
         """Selects some rows."""
@@ -146,6 +147,7 @@ class VolumeTrack:
             vertices_m=np.concatenate(parts) if parts else np.zeros((0, 3)),
             horizon_s=self.horizon_s[which],
             limbs=self.limbs,
+            rate_hz=self.rate_hz,
         )
 
 
@@ -334,7 +336,7 @@ def replay_scene(
         body_m=np.concatenate([_body(one.body, parts, t_ns) for one in each], axis=1),
         body_parts=tuple(of_person(part, number) for number in run.people for part in parts),
         body_radius_m=np.tile([radii_m[part] for part in parts], len(each)),
-        volumes=volume_track(named_volumes(run.occupancy)),
+        volumes=volume_track(named_volumes(run.occupancy), VOLUME_HZ if every == 1 else LONG_VOLUME_HZ),
         robot=robot_geometry(robot, (run.meta.get("urdf") or {}).get("text")),
         methods={name: _track(run, name, table, robot, t_ns, t0_ns, slow) for name, table in tables.items()},
         watched_m=np.array(((run.meta.get("cell") or {}).get("watched") or {}).get("corners_m", [])).reshape(-1, 2),
@@ -405,13 +407,13 @@ def at_rate(t_ns: Ints, rate_hz: float) -> Ints:
     return np.flatnonzero(np.isin(t_ns, instants[first]))
 
 
-def volume_track(occupancy: RunTable | None) -> VolumeTrack:
-    """Returns the stored volumes in order of time, at a rate of at most ``VOLUME_HZ``."""
+def volume_track(occupancy: RunTable | None, rate_hz: float) -> VolumeTrack:
+    """Returns the stored volumes in order of time, at a rate of at most ``rate_hz`` [Hz]."""
     if occupancy is None or not len(occupancy):
         nothing, none = np.zeros(0), np.zeros(0, np.int64)
-        return VolumeTrack(none, none, nothing, np.zeros(1, np.int64), np.zeros((0, 3)), nothing, ())
+        return VolumeTrack(none, none, nothing, np.zeros(1, np.int64), np.zeros((0, 3)), nothing, (), rate_hz)
     t_ns, (limb, limbs) = times(occupancy), pd.factorize(text_column(occupancy, "limb"))
-    shown, counts, flat = at_rate(t_ns, VOLUME_HZ), [], array("d")
+    shown, counts, flat = at_rate(t_ns, rate_hz), [], array("d")
     for first in range(0, len(shown), _TOGETHER):  # lists of numbers: all of a long run would be in memory three times
         hulls = occupancy.iloc[shown[first : first + _TOGETHER]]["vertices"].tolist()
         counts += [len(hull) // 3 for hull in hulls]
@@ -425,6 +427,7 @@ def volume_track(occupancy: RunTable | None) -> VolumeTrack:
         vertices_m=np.frombuffer(flat).reshape(-1, 3),
         horizon_s=numeric_column(occupancy, "horizon_s")[shown] if known else np.full(len(shown), np.nan),
         limbs=tuple(limbs.tolist()),
+        rate_hz=rate_hz,
     )
 
 

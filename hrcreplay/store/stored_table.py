@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import weakref
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar, Self, overload
-from weakref import WeakValueDictionary
 
 import numpy as np
 import pandas as pd
@@ -21,15 +21,15 @@ Anything = np.ndarray[tuple[int, ...], np.dtype[Any]]
 
 #: Number of groups of rows that are read together when only some of their rows are needed.
 _GROUPS = 16
-#: Memory of the columns of one file that are kept, as most are asked for more than once [bytes].
-_KEPT_BYTES = 16_000_000
+#: Memory of the columns of all files that are kept, as most are asked for more than once [bytes].
+_KEPT_BYTES = 32_000_000
 
 
 class StoredTable:
     """Rows and columns of a parquet file. What it has of pandas' DataFrame means the same.
 
     Asked for a column it returns a Series, for a list of columns a DataFrame, for a mask the rows that are True. Tables
-    made from it share its file; of that the columns that were asked for last are kept in memory, 16 MB of them.
+    made from it share its file; the columns of any file that were asked for last are kept in memory, 32 MB of them.
     """
 
     def __init__(
@@ -128,10 +128,37 @@ class StoredTable:
         return found[names]
 
 
-class _File:
-    """A parquet file, and the columns that were read last."""
+class _LastColumns:
+    """The columns of all files that were asked for last."""
 
-    _open: ClassVar[WeakValueDictionary[tuple[str, int, int, int], _File]] = WeakValueDictionary()
+    def __init__(self) -> None:
+        self._kept: OrderedDict[tuple[int, str], pd.Series[Any]] = OrderedDict()
+
+    def get(self, file: int, name: str) -> pd.Series[Any] | None:
+        """A column, if it is kept; files have numbers."""
+        if (file, name) in self._kept:
+            self._kept.move_to_end((file, name))
+        return self._kept.get((file, name))
+
+    def keep(self, file: int, name: str, column: pd.Series[Any]) -> None:
+        """Keeps a column, and fewer of those that were asked for before."""
+        self._kept[file, name] = column
+        while len(self._kept) > 1 and sum(column.nbytes for column in self._kept.values()) > _KEPT_BYTES:
+            self._kept.popitem(last=False)
+
+    def forget(self, file: int) -> None:
+        """Removes the columns of a file."""
+        for key in [key for key in self._kept if key[0] == file]:
+            del self._kept[key]
+
+
+_LAST = _LastColumns()
+
+
+class _File:
+    """A parquet file."""
+
+    _open: ClassVar[weakref.WeakValueDictionary[tuple[str, int, int, int], _File]] = weakref.WeakValueDictionary()
 
     @classmethod
     def of(cls, path: Path) -> _File:
@@ -145,7 +172,7 @@ class _File:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._kept: OrderedDict[str, pd.Series[Any]] = OrderedDict()
+        weakref.finalize(self, _LAST.forget, id(self))
         self._about = pq.read_metadata(path)
         self.names = tuple(self._about.schema.to_arrow_schema().names)
         self.length = int(self._about.num_rows)
@@ -174,13 +201,11 @@ class _File:
 
     def _column(self, name: str) -> pd.Series[Any]:
         """A whole column, kept or read."""
-        found = self._kept.pop(name, None)
+        found = _LAST.get(id(self), name)
         if found is None:
             with pq.ParquetFile(self._path, metadata=self._about) as file:
                 found = file.read(columns=[name], use_threads=False).to_pandas()[name]
-        self._kept[name] = found
-        while len(self._kept) > 1 and sum(column.nbytes for column in self._kept.values()) > _KEPT_BYTES:
-            self._kept.popitem(last=False)
+            _LAST.keep(id(self), name, found)
         return found
 
 

@@ -16,6 +16,7 @@ from hrcreplay.reporting import replay_scene
 from hrcreplay.reporting.metrics.contact import stop_events
 from hrcreplay.reporting.page.replay_page import MISSING, NumberBlock, replay_data
 from hrcreplay.reporting.replay_scene import (
+    LONG_VOLUME_HZ,
     SHOWN_POINTS,
     VOLUME_HZ,
     ReplayScene,
@@ -65,6 +66,12 @@ def test_a_run_of_more_than_ten_minutes_has_fewer_instants(scene: ReplayScene, m
     monkeypatch.setattr(replay_scene, "WHOLE_S", 4.0)  # so that 8 s are as twenty minutes
     thin = moving_scene(moving_run(8.0))
     assert thin.t_ns.tolist() == scene.t_ns[::2].tolist()
+    shown_ns, all_ns = np.unique(thin.volumes.t_ns), np.unique(scene.volumes.t_ns)
+    assert np.diff(shown_ns).min() >= 1e9 / LONG_VOLUME_HZ - 1
+    assert len(all_ns) == pytest.approx(VOLUME_HZ / LONG_VOLUME_HZ * len(shown_ns), abs=3.0)
+    header = json.loads(replay_data(thin)[0])
+    assert header["volumes"]["rate_hz"] == LONG_VOLUME_HZ
+    assert len(header["volumes"]["at_s"]) == len(thin.volumes.t_ns)
     assert (thin.rate_hz, scene.rate_hz) == (12.5, 25.0)
     np.testing.assert_array_equal(thin.methods["qp"].q, scene.methods["qp"].q[::2])
     assert json.loads(replay_data(thin)[0])["rate_hz"] == 12.5
@@ -208,7 +215,7 @@ def test_volumes_and_skeletons_are_the_same_in_parts(monkeypatch: pytest.MonkeyP
     assert run.measurements is not None
     monkeypatch.setattr(replay_scene, "_TOGETHER", 11)
     occupancy = frame_of(run.occupancy)
-    track, shown = volume_track(occupancy), occupancy.iloc[at_rate(occupancy["t_ns"].to_numpy(), VOLUME_HZ)]
+    track, shown = volume_track(occupancy, VOLUME_HZ), occupancy.iloc[at_rate(occupancy["t_ns"].to_numpy(), VOLUME_HZ)]
     assert len(track.t_ns) == len(shown) > 11
     for i, (_, row) in enumerate(shown.iterrows()):
         assert (track.t_ns[i], track.limbs[track.limb[i]], track.radius_m[i]) == (row.t_ns, row.limb, row.radius_m)

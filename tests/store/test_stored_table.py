@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from pathlib import Path
 from typing import Any
 
@@ -103,15 +104,44 @@ def test_columns_left_out_and_columns_made(tables: tuple[StoredTable, pd.DataFra
     same(stored[mask].assign(distance_m=0.5), frame[mask].assign(distance_m=0.5))
 
 
-def test_it_keeps_no_more_of_a_file_than_it_may(
-    tables: tuple[StoredTable, pd.DataFrame], monkeypatch: pytest.MonkeyPatch
+def test_of_all_files_it_keeps_no_more_than_it_may(
+    tables: tuple[StoredTable, pd.DataFrame], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stored, frame = tables
+    path = tmp_path / "other.parquet"
+    pq.write_table(pa.Table.from_pandas(frame, preserve_index=False), path)
+    other, last = StoredTable(path), stored_table._LastColumns()
+    number = {id(stored._file): "stored", id(other._file): "other"}
     monkeypatch.setattr(stored_table, "_KEPT_BYTES", 2 * 8 * N)
+    monkeypatch.setattr(stored_table, "_LAST", last)
+
+    def kept() -> list[tuple[str, str]]:
+        return [(number[file], name) for file, name in last._kept]
+
     for name in [*frame.columns, *frame.columns[::-1]]:
-        pd.testing.assert_series_equal(stored[name], frame[name])
-        assert sum(column.nbytes for column in stored._file._kept.values()) <= 2 * 8 * N or len(stored._file._kept) == 1
-    assert list(stored._file._kept) == ["person", "t_ns"]
+        for table in (stored, other):
+            pd.testing.assert_series_equal(table[name], frame[name])
+            assert sum(column.nbytes for column in last._kept.values()) <= 2 * 8 * N or len(kept()) == 1
+    assert kept() == [("stored", "t_ns"), ("other", "t_ns")]
+    assert stored["t_ns"].tolist() == frame["t_ns"].tolist()
+    assert other["person"].tolist() == frame["person"].tolist()
+    assert kept() == [("stored", "t_ns"), ("other", "person")], "other t_ns was asked for before"
+
+
+def test_columns_of_a_closed_table_are_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    last = stored_table._LastColumns()
+    monkeypatch.setattr(stored_table, "_LAST", last)
+    pq.write_table(pa.table({"t_ns": np.arange(5)}), tmp_path / "table.parquet")
+    table = StoredTable(tmp_path / "table.parquet")
+    assert table["t_ns"].tolist() == [0, 1, 2, 3, 4]
+    assert len(last._kept) == 1
+    rows = table[np.array([True, False, True, False, False])]
+    del table
+    gc.collect()
+    assert len(last._kept) == 1, "the file is still open for the rows"
+    del rows
+    gc.collect()
+    assert len(last._kept) == 0
 
 
 def test_tables_of_one_file_share_it_and_one_written_anew_is_read_anew(tmp_path: Path) -> None:

@@ -87,8 +87,9 @@ def programme_progress(motion: RunTable, ahead_m: float) -> tuple[float, float] 
         ahead_m: As for ``foot``: plan.max_reference_lead_m [m].
     """
     names = ["programme_s", *(f"{what}_{axis}" for what in ("ref", "tcp") for axis in "xyz")]
-    rows = motion[names].to_numpy(dtype=float)
-    rows, t_ns = rows[np.isfinite(rows).all(axis=1)], times(motion)
+    rows, t_ns = number_columns(motion, names), times(motion)
+    known = np.isfinite(rows).all(axis=1)
+    rows = rows if known.all() else rows[known]
     if len(rows) < 2:
         return None
     given_s = float(t_ns[-1] - t_ns[0]) * 1e-9

@@ -41,6 +41,7 @@ from hrcreplay.reporting.figures.scene import (
 )
 from hrcreplay.reporting.metrics.series import seconds_from
 from hrcreplay.reporting.replay_scene import (
+    LONG_VOLUME_HZ,
     VOLUME_HZ,
     MethodTrack,
     ReplayScene,
@@ -140,7 +141,7 @@ MISSING = -32768
 _LARGEST = 32767
 #: Maximum size of the block in base64 [bytes]; the volumes are stored at the highest of these rates that fits.
 BUDGET_BYTES = 9_000_000
-VOLUME_RATES_HZ = (VOLUME_HZ, 5.0, 2.5, 1.0, 0.5, 0.2)
+VOLUME_RATES_HZ = (VOLUME_HZ, LONG_VOLUME_HZ, 2.5, 1.0, 0.5, 0.2)
 #: Minimum share to which hulls are usually deflated.
 _AT_BEST = 0.3
 
@@ -292,7 +293,7 @@ def _add_track(block: NumberBlock, name: str, track: MethodTrack) -> None:
 def _volumes_within(volumes: VolumeTrack, left: int) -> tuple[NumberBlock, VolumeTrack, float | None]:
     """Returns the volumes at the highest rate that fits into a number of deflated bytes; None: at no rate."""
     counts = np.diff(volumes.offsets)
-    for rate_hz in VOLUME_RATES_HZ if len(volumes.t_ns) else ():
+    for rate_hz in [rate_hz for rate_hz in VOLUME_RATES_HZ if len(volumes.t_ns) and rate_hz <= volumes.rate_hz]:
         rows = at_rate(volumes.t_ns, rate_hz)
         if _AT_BEST * 6 * counts[rows].sum() > left:
             continue
