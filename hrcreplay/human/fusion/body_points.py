@@ -209,12 +209,17 @@ def distance_shown(point: Floats, start: Floats, along: Floats) -> float:
         start: (3,) of the model with the recent offsets [m].
         along: (3,) from there to where the camera showed it before; 0 if it has not shown it recently [m].
     """
-    apart = np.sqrt((along**2).sum())
+    squares, towards = 0.0, 0.0
+    for i in range(3):
+        squares += along[i] ** 2
+        towards += (point[i] - start[i]) * along[i]
+    apart = np.sqrt(squares)
     if apart <= ALIKE_M:
         return distance(point, start)
-    most = 1.0 - ALIKE_M / apart
-    share = max(0.0, min(most, ((point - start) * along).sum() / apart**2))
-    return distance(point, start + share * along)
+    share, nearest = max(0.0, min(1.0 - ALIKE_M / apart, towards / apart**2)), np.empty(3)
+    for i in range(3):
+        nearest[i] = start[i] + share * along[i]
+    return distance(point, nearest)
 
 
 @njit(cache=True, inner=True)

@@ -80,8 +80,8 @@ def validate_frame(filter_: Filter, c: int, now: int, rules: Rules, outliers: In
         disbelieved += filter_.gate.disbelieved[c]
         outliers[c] += len(trusted) - np.sum(trusted)
     _validate_rows(filter_.gate, c, trusted, rules.confidence_min)
-    for row in np.flatnonzero(filter_.gate.valid[c]):
-        if (DEPENDS[row] & believed).any():
+    for row in range(ROWS if believed.any() else 0):
+        if filter_.gate.valid[c, row] and (DEPENDS[row] & believed).any():
             filter_.estimate.row_ns[row] = min(
                 filter_.estimate.row_ns[row], now - rules.memory_ns - 1
             )  # lost: it restarts
@@ -206,6 +206,6 @@ def _whole(estimate: StateEstimate, z: Floats, disbelieved: Bools, now: int, rul
             estimate.lengths_var[k] = _UNKNOWN_M**2
         if apart > rules.bone_m + 3.0 * np.sqrt(estimate.lengths_var[k]):
             whole &= ~_ENDS[k]
-        elif not (_ENDS[k] & disbelieved).any():
+        elif not disbelieved.any() or not (_ENDS[k] & disbelieved).any():
             estimate.bone_ns[k] = now
     return whole

@@ -184,26 +184,23 @@ def predict(mean: Floats, P: Floats, dt: float, damping: float, sigma: Floats, r
         rest_std: (3,) standard deviations of v, a, j of an unseen joint [m or rad per s, s^2, s^3].
     """
     taylor = (1.0, dt, dt**2 / 2.0, dt**3 / 6.0)  # F of Eq. (43), corrected: s is p, v, a, j
+    kept = (1.0, damping, damping, damping)
     for a in range(4):
-        kept = damping if a > 0 else 1.0
-        mean[a] = kept * _ahead(taylor, mean, a)
+        for k in range(a + 1, 4):
+            mean[a] += taylor[k - a] * mean[k]
+        mean[a] *= kept[a]
         for b in range(4):
-            P[a, b] = kept * _ahead(taylor, P[:, b], a)
+            for k in range(a + 1, 4):
+                P[a, b] += taylor[k - a] * P[k, b]
+            P[a, b] *= kept[a]
     for a in range(4):
         for b in range(a, 4):
-            P[a, b] = (damping if b > 0 else 1.0) * _ahead(taylor, P[a], b)
+            for k in range(b + 1, 4):
+                P[a, b] += taylor[k - b] * P[a, k]
+            P[a, b] *= kept[b]
             P[b, a] = P[a, b]
     for a in range(4):
         P[a, a] += process_variance(a, dt, damping, sigma, rest_std)
-
-
-@njit(cache=True, inner=True)
-def _ahead(taylor: tuple[float, float, float, float], x: Floats, a: int) -> float:
-    """Row a of F times x (4,)."""
-    total = x[a]
-    for k in range(a + 1, 4):
-        total += taylor[k - a] * x[k]
-    return total
 
 
 @njit(cache=True, inner=True)

@@ -37,6 +37,8 @@ from hrcreplay.records import BODY, POINTS, Bools, Floats, Ints
 _BIN_M = 0.001
 #: Bins of a limb's samples; the last one contains all larger samples, far beyond those of the same person's arm.
 BINS = round(REACH_M / _BIN_M)
+#: Number of bins that are compared with 0 at once.
+_BLOCK = 64
 #: Minimum number of samples for a quantile.
 LEAST = 20
 
@@ -71,6 +73,7 @@ def observe(filter_: Filter, fresh: Bools, now: int, rules: Rules, outliers: Int
         rules: Settings of the filter.
         outliers: (c,) number of a camera's points that disagree with the person; those of broken legs are added.
     """
+    along = np.empty(3)
     for c in np.flatnonzero(fresh):
         p = extrapolate_back(filter_.estimate.mean, delay(filter_.gate.capture_ns[c], now, rules))
         plain = np.full(filter_.gate.points[0].shape, np.nan)
@@ -86,7 +89,8 @@ def observe(filter_: Filter, fresh: Bools, now: int, rules: Rules, outliers: Int
             sample = 0.0
             for k in _ENDS[limb]:
                 recent = now - filter_.model.carried_ns[c, k] <= SHOWN_NS
-                along = plain[k] + filter_.model.carried[c, k] - model[k] if recent else np.zeros(3)
+                for i in range(3):
+                    along[i] = plain[k, i] + filter_.model.carried[c, k, i] - model[k, i] if recent else 0.0
                 sample = max(sample, distance_shown(filter_.gate.points[c, k], model[k], along))
             _enter(filter_.model, limb, now, sample, rules)
         if shown[_LEGS]:
@@ -218,7 +222,8 @@ def _enter(model: ModelResidual, limb: int, now: int, sample: float, rules: Rule
     kept = np.exp(-age / rules.residual_memory_s)
     if sample >= model.peak[limb] or now - model.peak_ns[limb] >= rules.residual_hold_ns:
         model.peak[limb], model.peak_ns[limb] = sample, now
-    model.residuals[limb] *= kept
+    for k in range(_highest(model.residuals[limb])):
+        model.residuals[limb, k] *= kept
     model.residuals[limb, int(min(sample / _BIN_M, BINS - 1.0))] += 1.0  # inf cannot be converted to an integer
     model.weight[limb] = kept * model.weight[limb] + 1.0
     model.samples[limb] += 1
@@ -229,8 +234,23 @@ def _enter(model: ModelResidual, limb: int, now: int, sample: float, rules: Rule
 def _exceeded_by(weights: Floats, larger: float) -> float:
     """Returns the smallest upper end of a bin such that the samples above it have at most this weight [m]."""
     above = 0.0
-    bin_ = BINS
+    bin_ = _highest(weights)
     while bin_ > 1 and above + weights[bin_ - 1] <= larger:
         bin_ -= 1
         above += weights[bin_]
     return bin_ * _BIN_M
+
+
+@njit(cache=True, inner=True)
+def _highest(weights: Floats) -> int:
+    """Returns a number of bins beyond which all weights are 0; few are looked at one by one, as most are 0."""
+    bits = weights.view(np.int64)
+    past = BINS
+    while past > _BLOCK:
+        found = np.int64(0)
+        for k in range(past - _BLOCK, past):
+            found |= bits[k]
+        if found != 0:
+            break
+        past -= _BLOCK
+    return past
