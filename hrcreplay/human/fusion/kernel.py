@@ -73,7 +73,7 @@ def run(ticks_ns: Ints, frames: Frames, filter_: Filter, rules: Rules, track: Tr
             _leave(filter_, k, rules, track, damping)
 
 
-@njit(cache=True, inner=True)
+@njit(inner=True, inline="always")  # passing the filter on would take longer than this
 def _predict(estimate: StateEstimate, now: int, rules: Rules, damping: Floats) -> None:
     """Computes the a-priori estimate, Eq. (48), (49).
 
@@ -194,7 +194,7 @@ def _rename(mean: Floats) -> None:
         mean[first : first + 4, 0] = arm
 
 
-@njit(cache=True, inner=True)
+@njit(inner=True, inline="always")  # passing the filter on would take longer than this
 def _leave(filter_: Filter, k: int, rules: Rules, track: Track, damping: Floats) -> None:
     now = filter_.estimate.tick_ns[0]
     for j in range(DOF):
