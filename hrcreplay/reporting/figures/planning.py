@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import chain
 from dataclasses import dataclass
 from typing import Any
 
@@ -73,12 +74,11 @@ def path(
     limbs = _limbs_at(occupancy, motion, worst)
     figure = drawing.column_figure(2.45)
     (above, side), *_ = drawing.column_panels(figure, 1, 2, bottom_in=0.62)
-    shown = [position_columns(motion, "ref"), position_columns(motion, "tcp")]
-    if T_world_base is not None:
-        shown.append(T_world_base[None, :3, 3])
+    base = np.zeros((0, 3)) if T_world_base is None else T_world_base[None, :3, 3]
     for ax, view in ((above, ABOVE), (side, SIDE)):
         _draw_path(ax, view, motion, limbs, worst)
-        low, high = bounds_of([view.flat(points) for points in shown], 0.08)
+        paths = (view.flat(position_columns(motion, what)) for what in ("ref", "tcp"))  # one by one: they may be long
+        low, high = bounds_of(chain(paths, [view.flat(base)]), 0.08)
         drawing.set_window(ax, low.tolist(), high.tolist())
         if T_world_base is not None:
             ax.plot(*view.flat(T_world_base[None, :3, 3]).T, "s", color=drawing.INK, ms=4, zorder=3)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
@@ -251,12 +251,13 @@ def draw_objects(ax: Axes, objects: Sequence[StaticHull], view: View) -> None:
     ax.add_collection(polygons, autolim=False)
 
 
-def bounds_of(edges: Sequence[Floats], margin_m: float) -> tuple[Floats, Floats]:
+def bounds_of(edges: Iterable[Floats], margin_m: float) -> tuple[Floats, Floats]:
     """Returns the corners (2,) of the box around points (k, 2), with a margin [m]; unknown points are left out."""
-    corners = np.vstack([np.zeros((0, 2)), *edges])
-    corners = corners[np.isfinite(corners).all(axis=1)]
-    if not len(corners):
+    known = (points[np.isfinite(points).all(axis=1)] for points in edges)
+    ends = [np.stack([points.min(axis=0), points.max(axis=0)]) for points in known if len(points)]
+    if not ends:
         return np.full(2, -margin_m), np.full(2, margin_m)
+    corners = np.concatenate(ends)
     return corners.min(axis=0) - margin_m, corners.max(axis=0) + margin_m
 
 

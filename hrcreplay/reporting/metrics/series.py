@@ -218,9 +218,12 @@ def _nearest_vertices(points: Floats, path: Floats) -> Ints:
     A programme passes the same places in each cycle: only one vertex per cell is tested, and from there the search
     follows the path while the distance decreases.
     """
-    cells = np.floor(path / _CELL_M).astype(np.int64)
-    cells -= cells.min(axis=0)
-    _, first = np.unique(np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1)), return_index=True)
+    cell = np.zeros(len(path), np.int64)
+    for coordinate in path.T:
+        along = np.floor(coordinate / _CELL_M).astype(np.int64)
+        along -= along.min()
+        cell = cell * (along.max() + 1) + along
+    _, first = np.unique(cell, return_index=True)
     vertices = first[cKDTree(path[first]).indices]  # neighbours in space come one after the other
     points, path = np.ascontiguousarray(points), np.ascontiguousarray(path)
     found: Ints = vertices[nearest_vertices(points, path[vertices])]
