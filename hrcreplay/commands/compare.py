@@ -28,9 +28,9 @@ from hrcreplay.evaluation.contact import (
     Predicted,
     compute_full_coverage,
     compute_own_coverage,
-    read_recorded_people,
     write_rows,
 )
+from hrcreplay.evaluation.judging import read_recorded_people
 from hrcreplay.evaluation.recorded_person import RecordedPeople
 from hrcreplay.evaluation.severity import severity_table
 from hrcreplay.logs.reader import Log, open_log

@@ -182,7 +182,7 @@ def _report(
 ) -> None:
     """Writes the contact table and the report of a run whose other tables are written."""
     from hrcreplay.commands.report import write_report
-    from hrcreplay.evaluation.contact import (
+    from hrcreplay.evaluation.judging import (
         write_contact,  # both are slow to load, and the other commands need neither
     )
 

@@ -58,7 +58,7 @@ def _compile_person(scratch: Path) -> None:
 
     The sound prediction comes first: the other process needs it once its robot has moved with nobody there.
     """
-    from hrcreplay.evaluation.contact import write_contact
+    from hrcreplay.evaluation.judging import write_contact
 
     how: Any = {"cell_file": replay.demo_cell(), **_SPAN}
     ahead = resolve("plan", replay.demo_log(), **how)

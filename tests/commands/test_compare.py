@@ -16,7 +16,7 @@ import pytest
 
 from hrcreplay.commands import compare, replay
 from hrcreplay.errors import SettingsError
-from hrcreplay.evaluation.contact import read_recorded_people
+from hrcreplay.evaluation.judging import read_recorded_people
 from hrcreplay.evaluation.recorded_person import at_instants
 from hrcreplay.human.model import skeleton
 from hrcreplay.logs.reader import open_log

@@ -15,7 +15,7 @@ import pytest
 from hrcreplay.commands import replay
 from hrcreplay.commands.report import summary
 from hrcreplay.evaluation import recorded_person
-from hrcreplay.evaluation.contact import read_recorded_people
+from hrcreplay.evaluation.judging import read_recorded_people
 from hrcreplay.evaluation.recorded_person import CameraPoints
 from hrcreplay.geometry.distances import segment_distance
 from hrcreplay.logs.reader import open_log

@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from hrcreplay.commands import compare, replay
-from hrcreplay.evaluation.contact import read_recorded_people
+from hrcreplay.evaluation.judging import read_recorded_people
 from hrcreplay.evaluation.severity import CONTACT, NEAREST, Meeting, merged_runs, transferred_j
 from hrcreplay.human.contact_limits import REGIONS
 from hrcreplay.human.model import part_radii

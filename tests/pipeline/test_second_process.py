@@ -50,10 +50,10 @@ def test_two_processes_write_the_same_bytes_as_one(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(replay, "run_stages", stages)
     how: Any = {"cell_file": replay.demo_cell(), "start_s": 8.0, "end_s": 9.0}
     found = []
-    stretch = contact._STRETCH
+    stretch = contact.STRETCH
     for processes in (1, 2):
         assert not taken
-        monkeypatch.setattr(contact, "_STRETCH", 64 if processes == 1 else stretch)  # rows that are made together
+        monkeypatch.setattr(contact, "STRETCH", 64 if processes == 1 else stretch)  # rows that are made together
         folder = replay.execute(
             resolve("report", replay.demo_log(), **how), tmp_path / str(processes), processes=processes
         )

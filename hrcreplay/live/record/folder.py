@@ -15,7 +15,7 @@ import pyarrow as pa
 
 from hrcreplay.commands.report import write_report
 from hrcreplay.errors import LogError, SettingsError
-from hrcreplay.evaluation.contact import write_contact
+from hrcreplay.evaluation.judging import write_contact
 from hrcreplay.live import processes
 from hrcreplay.live.control.setup import build_scene, run_config_of
 from hrcreplay.live.record import codec
