@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hrcreplay.kernels import Held
 from hrcreplay.pipeline.batch.ticks import MotionColumns, Moving, PeopleAhead, Way, empty_columns, run_ticks
 from hrcreplay.pipeline.surroundings import Forecast
 from hrcreplay.records import RECORDED, Ints, Motion
@@ -59,11 +60,11 @@ class Planner:
     def follow(self, t_ns: Ints, outlook: Forecast, limbs: tuple[str, ...]) -> Motion:
         """The motion of a batch of ticks with the predicted volumes of each; ``limbs`` names all possible volumes."""
         columns = empty_columns(len(t_ns), self.robot.nv)
-        way, people, tick, patience = _WAYS.get(type(self.controller)), outlook.ahead, 0, 1
+        way, tick, patience = _WAYS.get(type(self.controller)), 0, 1
         while tick < len(t_ns):
             last = len(t_ns)
-            if way is not None and people is not None:
-                done = self._run(way, people, columns, tick)
+            if way is not None and outlook.ahead is not None:
+                done = self._run(way, outlook.how, outlook.ahead, columns, tick)
                 patience = 1 if done > tick else min(2 * patience, _MOST_LEFT)
                 tick, last = done, min(done + patience, len(t_ns))
             for one in range(tick, last):
@@ -72,12 +73,12 @@ class Planner:
         links = tuple(segment.name for segment in self.robot.segments)
         return Motion(t_ns=t_ns, **columns._asdict(), limbs=limbs, links=links, reasons=REASONS)
 
-    def _run(self, way: Way, people: PeopleAhead, columns: MotionColumns, tick: int) -> int:
+    def _run(self, way: Way, how: Held, people: PeopleAhead, columns: MotionColumns, tick: int) -> int:
         """Moves the robot in the kernel as far as it can from a tick on; returns the first tick that is not done."""
         own = self.controller
         if not way.by_qp and np.isnan(own.stop.along[0, 0]):
             return tick  # it continues the stop of another method
-        done, moving = run_ticks(*own.scene, way, people, Moving(own.moment, own.point), columns, tick)
+        done, moving = run_ticks(own.scene, way, how, people, Moving(own.moment, own.point), columns, tick)
         (own.stop, own.u, own.s_s, _, own.planes), own.point = moving
         return done
 

@@ -11,6 +11,7 @@ import numpy as np
 from hrcreplay.human.fusion.vacancy import WatchedArea
 from hrcreplay.human.model import LimitSet
 from hrcreplay.human.prediction import swept_volumes
+from hrcreplay.kernels import Held
 from hrcreplay.pipeline.batch.ticks import KNOWN, LEFT, TOO_OLD, PeopleAhead, hulls_of
 from hrcreplay.records import BORDER, Floats, HumanStates, SweptVolumes, volume_name
 from hrcreplay.robot.control.border import Border
@@ -176,10 +177,13 @@ class Forecast:
             self._first,
             np.array(states.numbers),  # a copy, which is not protected
             np.where(by_hand, LEFT, np.where(too_old, TOO_OLD, KNOWN)),
-            person.predictor.rules,
-            person.predictor.work,
             person.predictor.prediction.latency_s,
         )
+
+    @property
+    def how(self) -> Held:
+        """Rules of the volumes for the kernels that take ``ahead``."""
+        return self.person.predictor.how
 
     @cached_property
     def full(self) -> SweptVolumes:
@@ -217,7 +221,7 @@ class Forecast:
 
     def _alone(self, ahead: PeopleAhead, tick: int, horizon_s: float) -> Obstacles:
         """Obstacles of a tick alone, in one kernel: in half the time, and the same numbers."""
-        hulls = hulls_of(ahead, tick, horizon_s)
+        hulls = hulls_of(self.how, ahead, tick, horizon_s)
         found = Obstacles(hulls.vertices, hulls.offsets, hulls.radius, hulls.boxes, hulls.known, horizon_s)
         return self.around.numbered(found, ahead.number[self.rows(tick)].tolist())
 

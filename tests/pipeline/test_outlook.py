@@ -11,6 +11,7 @@ import pytest
 
 from hrcreplay.commands import replay
 from hrcreplay.human.model import skeleton
+from hrcreplay.kernels import Held
 from hrcreplay.logs.reader import open_log
 from hrcreplay.pipeline import assembly, stages, surroundings
 from hrcreplay.pipeline.batch.ticks import PeopleAhead, hulls_of
@@ -67,9 +68,9 @@ def test_a_tick_alone_is_computed_in_one_kernel_and_has_the_same_numbers(monkeyp
     alone: list[int] = []
     compute = hulls_of
 
-    def listening(people: PeopleAhead, tick: int, horizon_s: float) -> TickHulls:
+    def listening(how: Held, people: PeopleAhead, tick: int, horizon_s: float) -> TickHulls:
         alone.append(tick)
-        return compute(people, tick, horizon_s)
+        return compute(how, people, tick, horizon_s)
 
     monkeypatch.setattr(surroundings, "hulls_of", listening)
     for people in (states.rows(slice(200, 260)), crowd(1, 2), crowd(3, 1, 2)):

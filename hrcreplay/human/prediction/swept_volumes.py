@@ -37,7 +37,7 @@ from hrcreplay.human.prediction.sweep import (
     sweep_rot,
     sweep_walk,
 )
-from hrcreplay.kernels import njit
+from hrcreplay.kernels import Held, hold, njit
 from hrcreplay.records import BODY, DOF, LIMBS, Bools, Floats, HumanStates, Ints, SweptVolumes, Table
 from hrcreplay.settings.sections import Prediction
 
@@ -291,6 +291,11 @@ class Predictor:
     def rules(self) -> SoundRules:
         """Settings and bounds of ``sound``."""
         return sound_rules(self.limits, self.prediction, self.limbs_m, self.memory_s)
+
+    @cached_property
+    def how(self) -> Held:
+        """Rules and surface for kernels that compute volumes."""
+        return hold((self.rules, self.work))
 
     @cached_property
     def work(self) -> Surface:

@@ -11,18 +11,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hrcreplay.geometry.hull_reduction import Surface
 from hrcreplay.geometry.vectors import norm_n
-from hrcreplay.human.prediction.sound_volumes import SoundRows, SoundRules, sweep_sound
-from hrcreplay.kernels import njit
+from hrcreplay.human.prediction.sound_volumes import SoundRows, sweep_sound
+from hrcreplay.kernels import Held, njit
 from hrcreplay.records import Bools, Floats, Ints
-from hrcreplay.robot.control.control_step import Taken, TickRules, horizon_after
+from hrcreplay.robot.control.control_step import Taken, horizon_after
 from hrcreplay.robot.control.path_tick import decide_on_path
 from hrcreplay.robot.control.qp_tick import TickHulls, TickStart, decide_at_once
 from hrcreplay.robot.control.separation import NearestLink, boxes
-from hrcreplay.robot.control.static_obstacles import StaticShapes
-from hrcreplay.robot.kinematics import Arm, RobotPose
-from hrcreplay.robot.task import Grid, ReferencePoint, sample
+from hrcreplay.robot.kinematics import RobotPose
+from hrcreplay.robot.task import ReferencePoint, sample
 
 #: A tick for the kernel: all people are known, or the newest frame of one is too old; or it is left to Python.
 KNOWN, TOO_OLD, LEFT = range(3)
@@ -35,8 +33,6 @@ class PeopleAhead(NamedTuple):
     first: Ints  #: (n + 1,) first row of each tick
     number: Ints  #: number of each row's person
     what: Ints  #: (n,) KNOWN, TOO_OLD or LEFT
-    rules: SoundRules
-    work: Surface
     latency_s: float  #: from the newest capture to the robot's reaction [s]
 
 
@@ -88,11 +84,9 @@ def empty_columns(ticks: int, axes: int) -> MotionColumns:
 
 @njit(cache=True)
 def run_ticks(
-    arm: Arm,
-    grid: Grid,
-    rules: TickRules,
-    static: StaticShapes,
+    scene: Held,
     way: Way,
+    how: Held,
     people: PeopleAhead,
     moving: Moving,
     found: MotionColumns,
@@ -101,11 +95,9 @@ def run_ticks(
     """Moves a robot tick by tick, until the end of the batch or a tick that is left to Python.
 
     Args:
-        arm: The manipulator.
-        grid: The programmed path.
-        rules: Weights and limits.
-        static: Objects of the cell and pairs of links.
+        scene: Arm, programmed path, rules and objects.
         way: The method.
+        how: ``SoundRules``, and a surface to work with.
         people: The people of the batch.
         moving: Robot and reference at the first tick; a robot along its path is on it.
         found: Receives the rows.
@@ -114,10 +106,11 @@ def run_ticks(
     Returns:
         The first tick that is not done, and robot and reference then.
     """
+    arm, grid, rules, static = scene.value
     while tick < len(found.status) and people.what[tick] != LEFT:
         start = moving.start
         horizon_s = horizon_after(len(start.stop.q) - 1, rules.ahead)
-        hulls = hulls_of(people, tick, horizon_s)
+        hulls = hulls_of(how, people, tick, horizon_s)
         if way.by_qp:
             seen = decide_at_once(arm, grid, rules, static, start, hulls)
             if not seen.decided:
@@ -141,11 +134,19 @@ def run_ticks(
 
 
 @njit(cache=True)
-def hulls_of(people: PeopleAhead, tick: int, horizon_s: float) -> TickHulls:
-    """The volumes of a tick that is not left to Python, as far as they are known; valid for ``horizon_s`` [s]."""
+def hulls_of(how: Held, people: PeopleAhead, tick: int, horizon_s: float) -> TickHulls:
+    """The volumes of a tick that is not left to Python, as far as they are known.
+
+    Args:
+        how: ``SoundRules``, and a surface to work with.
+        people: The people of the batch.
+        tick: The tick.
+        horizon_s: Time from the tick on for which they are valid [s].
+    """
     first, last = people.first[tick], people.first[tick + 1]
     span_s = np.full(last - first, horizon_s + people.latency_s)
-    vertices, offsets, radii = sweep_sound(people.rows, first, last, span_s, people.rules, people.work)
+    rules, work = how.value
+    vertices, offsets, radii = sweep_sound(people.rows, first, last, span_s, rules, work)
     radius = radii.reshape(-1)
     around, known = boxes(vertices, offsets, radius)
     return TickHulls(vertices, offsets, radius, around, known and people.what[tick] == KNOWN, horizon_s)

@@ -5,10 +5,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from hrcreplay.kernels import Held, hold
 from hrcreplay.records import MotionRow
 from hrcreplay.robot.control import path_controller, qp_controller
 from hrcreplay.robot.control.certificate import NO_PLANES, decide
@@ -25,7 +27,6 @@ from hrcreplay.robot.control.control_step import (
     Step,
     Stop,
     Taken,
-    TickRules,
     at_rest,
     make_step,
     motion_row,
@@ -34,12 +35,11 @@ from hrcreplay.robot.control.control_step import (
     standstill_reason,
 )
 from hrcreplay.robot.control.qp_controller import QpContext
-from hrcreplay.robot.control.qp_tick import QpTick, TickHulls, TickStart, decide_at_once
+from hrcreplay.robot.control.qp_tick import QpTick, TickHulls, TickStart, decide_held
 from hrcreplay.robot.control.separation import Obstacles
-from hrcreplay.robot.control.static_obstacles import StaticObstacles, StaticShapes, shapes_of
-from hrcreplay.robot.kinematics import Arm
+from hrcreplay.robot.control.static_obstacles import StaticObstacles, shapes_of
 from hrcreplay.robot.model import RobotModel
-from hrcreplay.robot.task import Grid, Reference, ReferencePoint, follow, place
+from hrcreplay.robot.task import Reference, ReferencePoint, follow, place
 
 
 class ControllerTick(NamedTuple):
@@ -93,10 +93,11 @@ class Controller(ABC):
         """Robot and reference as numbers for the kernel of a tick."""
         return TickStart(self.stop, self.u, self.s_s, self.point.T_world_tcp, self.planes)
 
-    @property
-    def scene(self) -> tuple[Arm, Grid, TickRules, StaticShapes]:
-        """What no tick changes, as numbers for the kernel of a tick."""
-        return self.robot.arm, self.reference.grid, self.settings.tick_rules, shapes_of(self.robot, self.static)
+    @cached_property
+    def scene(self) -> Held:
+        """What no tick changes, for the kernel of a tick: arm, programmed path, rules and objects."""
+        static = shapes_of(self.robot, self.static)
+        return hold((self.robot.arm, self.reference.grid, self.settings.tick_rules, static))
 
     def take_over(self, stop: Stop) -> None:
         """Takes over the robot from another controller, together with its certified stop."""
@@ -155,7 +156,8 @@ class QpController(Controller):
     def decide(self, predict: Predict) -> tuple[Observation, Taken]:
         """The people at the tick, and the motion that the robot executes; in one kernel, see ``qp_tick``."""
         obstacles, horizon_s = self._volumes(predict)
-        found = decide_at_once(*self._numbers(obstacles, horizon_s))
+        hulls = obstacles.vertices_m, obstacles.offsets, obstacles.radius_m, obstacles.boxes_m
+        found = decide_held(self.scene, self.moment, TickHulls(*hulls, obstacles.known, horizon_s))
         sight = sight_of(found.pose, found.finite, found.nearest, obstacles)
         seen = Observation(sight, obstacles, horizon_s, predict)
         self.s_s, self.point = found.s_s, found.point
@@ -188,13 +190,6 @@ class QpController(Controller):
         target = qp_controller.Target(self.point.T_world_tcp, rate * self.point.twist, self.point.q, tcp_speed_max)
         seen_until = seen.sight, seen.obstacles, seen.horizon_s
         return QpContext(self.robot, self.state, self.u, target, *seen_until, self.static)
-
-    def _numbers(
-        self, obstacles: Obstacles, horizon_s: float
-    ) -> tuple[Arm, Grid, TickRules, StaticShapes, TickStart, TickHulls]:
-        """The input of a tick as numbers for the kernel."""
-        hulls = obstacles.vertices_m, obstacles.offsets, obstacles.radius_m, obstacles.boxes_m
-        return *self.scene, self.moment, TickHulls(*hulls, obstacles.known, horizon_s)
 
     def _move_on(self) -> None:
         """Does nothing: ``qp_context`` has already advanced the reference."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from hrcreplay.kernels import njit
+from hrcreplay.kernels import Held, njit
 from hrcreplay.records import Floats, Ints
 from hrcreplay.robot.control.control_step import (
     INSIDE,
@@ -103,6 +103,19 @@ def decide_at_once(
         if solved and rules.certified:
             decided, taken, planes = _decide(arm, rules, stop, stops, held, people, planes, static)
     return QpTick(pose, finite, nearest, reason, s_s, rate, point, cap, solved, held, stops, decided, taken, planes)
+
+
+@njit(cache=True)
+def decide_held(scene: Held, moment: TickStart, people: TickHulls) -> QpTick:
+    """The same for calls from Python, which would convert the scene's arrays each time.
+
+    Args:
+        scene: Arm, programmed path, rules and objects.
+        moment: Robot and reference when the tick begins.
+        people: Their volumes.
+    """
+    arm, grid, rules, static = scene.value
+    return decide_at_once(arm, grid, rules, static, moment, people)
 
 
 @njit(cache=True, inner=True)

@@ -22,7 +22,7 @@ from hrcreplay.robot.control.control_step import (
     PlanSettings,
 )
 from hrcreplay.robot.control.controllers import Controller, QpController
-from hrcreplay.robot.control.qp_tick import decide_at_once
+from hrcreplay.robot.control.qp_tick import decide_held
 from hrcreplay.robot.control.separation import Obstacles, no_obstacles, obstacles
 from hrcreplay.robot.control.static_obstacles import StaticObstacles
 from hrcreplay.robot.model import RobotModel, irb140
@@ -76,11 +76,11 @@ def run(controller: QpController, people: list[Obstacles]) -> Counter[tuple[bool
     asked = []
 
     def listening(*given: Any) -> Any:
-        asked.append(decide_at_once(*given))
+        asked.append(decide_held(*given))
         return asked[-1]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("hrcreplay.robot.control.controllers.decide_at_once", listening)
+        patch.setattr("hrcreplay.robot.control.controllers.decide_held", listening)
         for seen in people:
             seen_there, taken, after = in_python(controller, seen)
             expected = (*pieces(seen_there), *pieces(taken))
