@@ -22,13 +22,13 @@ import pyarrow.parquet as pq
 from hrcreplay.commands.notes import notes_of
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.pipeline import assembly, reuse, stages
-from hrcreplay.pipeline.fusion_stage import SeenBodies
 from hrcreplay.pipeline.kernel_build import ensure_compiled
 from hrcreplay.pipeline.methods_elsewhere import MethodsElsewhere
 from hrcreplay.pipeline.progress import NO_PROGRESS, Progress, ProgressBar, print_note
 from hrcreplay.pipeline.robot_mass import robot_mass
 from hrcreplay.pipeline.run_config import RunConfig, RunOptions, resolve
 from hrcreplay.pipeline.second_process import MANY, second_process
+from hrcreplay.pipeline.seen_bodies import SeenBodies
 from hrcreplay.pipeline.stages import Sink, Told, collect_fusion_findings, collect_plan_findings
 from hrcreplay.pipeline.stored_volumes import store_every
 from hrcreplay.records import RECORDED, HumanStates, Ints
@@ -104,7 +104,7 @@ def execute(
         reused = reuse.take_over(run_config, parts, writer, smooth=smooth)
         for stage in [stage for stage in run_config.stages if stage not in reused][-1:]:
             bar.begin(stage, len(ticks_ns))
-        seen = SeenBodies() if run_config.command == "report" and "fuse" not in reused else None
+        seen = SeenBodies(writer.partial) if run_config.command == "report" and "fuse" not in reused else None
         sink = Sink(writer, Stopwatch(time.perf_counter_ns), bar.advance, seen=seen)
         compared = run_config.command == "report" and not log.header.has_truth  # this then includes the smoothed person
         two = processes > 1 and len(ticks_ns) >= MANY and "plan" in run_config.stages

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hrcreplay.evaluation.recorded_person import LIMB_POINTS, RecordedPerson, Rows
+from hrcreplay.evaluation.recorded_person import LIMB_POINTS, RecordedPerson
 from hrcreplay.geometry.distances import farthest_at_most
 from hrcreplay.geometry.inflated_hull import InflatedHull, union_volume_m3
 from hrcreplay.human.prediction.sound_reach import THIGH_M
@@ -20,6 +20,7 @@ from hrcreplay.human.prediction.swept_volumes import limb_radii
 from hrcreplay.pipeline.surroundings import PredictionStage
 from hrcreplay.records import BODY, LIMBS, POINTS, Bools, Floats, HumanStates, Ints, SweptVolumes, Table
 from hrcreplay.settings.sections import Fusion
+from hrcreplay.store.stored_array import Rows
 
 #: Rate of the checked ticks [Hz].
 AUDIT_HZ = 25.0

@@ -27,11 +27,11 @@ from hrcreplay.evaluation.severity import severity_table
 from hrcreplay.human.model import PARTS
 from hrcreplay.logs.reader import Log
 from hrcreplay.pipeline import assembly, stages
-from hrcreplay.pipeline.fusion_stage import SeenBodies
 from hrcreplay.pipeline.people_smoother import PeopleSmoother
 from hrcreplay.pipeline.person_fuser import PersonFuser
 from hrcreplay.pipeline.run_config import RunConfig
 from hrcreplay.pipeline.second_process import read_apart, write_apart
+from hrcreplay.pipeline.seen_bodies import SeenBodies
 from hrcreplay.records import (
     JOINTS,
     LENGTHS,

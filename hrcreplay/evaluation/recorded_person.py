@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
@@ -19,9 +18,10 @@ from hrcreplay.errors import LogError
 from hrcreplay.human.fusion import fuse, inverse_kinematics
 from hrcreplay.human.model import part_axes, skeleton
 from hrcreplay.logs.reader import Log
-from hrcreplay.pipeline.fusion_stage import FusionStage, SeenBodies, as_frames
+from hrcreplay.pipeline.fusion_stage import FusionStage, as_frames
 from hrcreplay.pipeline.people_smoother import PeopleSmoother
 from hrcreplay.pipeline.person_fuser import PersonFuser
+from hrcreplay.pipeline.seen_bodies import Bodies, SeenBodies
 from hrcreplay.pipeline.stages import batches
 from hrcreplay.records import (
     LENGTHS,
@@ -34,7 +34,7 @@ from hrcreplay.records import (
     Measurements,
     find_neighbours,
 )
-from hrcreplay.store.stored_array import StoredArray
+from hrcreplay.store.stored_array import Rows, SomeRows, StoredArray
 
 TRUTH, CAMERAS, SMOOTHED = "ground truth", "camera points", "smoothed estimate"
 
@@ -90,33 +90,6 @@ GAP_S = 0.1
 #: Time before and after a frame for which a camera's point counts if no neighbouring frame shows it: half a period of a
 #: slow camera [s].
 _HOLD_S = 0.02
-
-
-class Rows(Protocol):
-    """An array, or what gives some of its rows when they are asked for."""
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Its shape; the first axis is that of the rows."""
-
-    def __getitem__(self, rows: slice | Ints, /) -> Floats:
-        """Some of the rows."""
-
-
-@dataclass(frozen=True)
-class SomeRows:
-    """Some rows of an array as an array of their own."""
-
-    every: Rows
-    mine: Ints  #: (n,) the rows
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Number of these rows, and shape of a row."""
-        return len(self.mine), *self.every.shape[1:]
-
-    def __getitem__(self, rows: slice | Ints) -> Floats:
-        return self.every[self.mine[rows]]
 
 
 @dataclass(frozen=True)
@@ -315,10 +288,12 @@ def read_people(
         ticks_ns: (n,) ticks of the span, increasing [ns].
         fusion_stage: Cameras, and settings of stage 1.
         smoothed_people: Returns the smoothed people at these ticks; called for people without ground truth.
-        bodies: The bodies that stage 1 saw in the span, which are taken; None: it is run again for them.
+        bodies: The bodies that stage 1 saw in the span, which are taken and closed; None: it is run again for them.
         folder: Folder for files of the people's points, as long as they are needed; None: they stay in memory.
     """
-    seen, others = (_see_bodies(log, ticks_ns, fusion_stage) if bodies is None else bodies).take()
+    bodies = _see_bodies(log, ticks_ns, fusion_stage, folder) if bodies is None else bodies
+    seen, beside = bodies.take()
+    others = None if beside is None else beside.rows(slice(None))
     truth = _truth(log, ticks_ns, folder)
     of_truth = 1 if truth is None or seen is None else _nearest_to(truth, seen)
     people = []
@@ -328,28 +303,34 @@ def read_people(
     best = smoothed_people() if rest else None
     for number in rest:
         own = best.of_person(number) if best is not None else None
-        mine = seen if seen is None or (seen.body == number).all() else seen.rows(seen.body == number)
+        mine = seen
+        if seen is not None and not (seen.about.body == number).all():
+            mine = seen.some(np.flatnonzero(seen.about.body == number))
         if own is not None and mine is not None and number > 1:  # bodies that were not yet a person
             known = np.isfinite(own.p[:][:, 0])
             since_ns = int(own.t_ns[known][0]) if known.any() else 2**62
-            early = mine.capture_ns < since_ns
-            others = CameraFrames.join([*([] if others is None else [others]), mine.rows(early)])
-            mine = mine.rows(~early)
+            early = mine.about.capture_ns < since_ns
+            before = mine.rows(np.flatnonzero(early))
+            others = CameraFrames.join([*([] if others is None else [others]), before])
+            mine = mine.some(np.flatnonzero(~early))
             if not known.any():
                 continue
         if own is not None:
             people.append(_recorded_person(number, mine, own, fusion_stage, folder))
     if truth is not None:
-        chosen = [] if seen is None else [_renamed(seen.rows(seen.body == of_truth), _CHOSEN)]
+        chosen = []
+        if seen is not None:
+            chosen = [_renamed(seen.rows(np.flatnonzero(seen.about.body == of_truth)), _CHOSEN)]
         tracks = _people_off(truth, [*chosen, *([] if others is None else [others])], fusion_stage)
     else:
         tracks = tuple(_tracks_of(others, fusion_stage)) if others is not None else ()
+    bodies.close()
     return RecordedPeople(tuple(sorted(people, key=lambda one: one.number)), tracks)
 
 
-def _see_bodies(log: Log, ticks_ns: Ints, fusion_stage: FusionStage) -> SeenBodies:
+def _see_bodies(log: Log, ticks_ns: Ints, fusion_stage: FusionStage, folder: Path | None) -> SeenBodies:
     """Runs stage 1 for the bodies in a span."""
-    fuser, bodies = PersonFuser(replace(fusion_stage, watched=None), log.header.cameras), SeenBodies()
+    fuser, bodies = PersonFuser(replace(fusion_stage, watched=None), log.header.cameras), SeenBodies(folder)
     for ticks, due in batches(log.frames(int(ticks_ns[0]), int(ticks_ns[-1]) + 1), ticks_ns, _BATCH):
         if due is not None or fusion_stage.people != "nearest":
             bodies.add(fuser.update(ticks, due)[1])
@@ -360,32 +341,36 @@ def _renamed(bodies: CameraFrames, body: int) -> CameraFrames:
     return replace(bodies, body=np.full(len(bodies), body))
 
 
-def _numbers(seen: CameraFrames | None) -> list[int]:
-    return sorted({1, *seen.body.tolist()}) if seen is not None else [1]
+def _numbers(seen: Bodies | None) -> list[int]:
+    return sorted({1, *seen.about.body.tolist()}) if seen is not None else [1]
 
 
-def _nearest_to(truth: BodyTrack, seen: CameraFrames) -> int:
+def _nearest_to(truth: BodyTrack, seen: Bodies) -> int:
     """Number of the person whom the ground truth shows: the nearest to it in the median."""
-    there = at_instants(truth.t_ns, truth.points_m, seen.capture_ns, GAP_S)
-    off = np.linalg.norm(seen.points_m - there, axis=2)
-    known = np.isfinite(off)
-    apart_m = np.where(known, off, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
+    apart_m = np.empty(len(seen))
+    for first in range(0, len(seen), _BATCH):
+        rows = slice(first, first + _BATCH)
+        there = at_instants(truth.t_ns, truth.points_m, seen.about.capture_ns[rows], GAP_S)
+        off = np.linalg.norm(seen.points_m[rows] - there, axis=2)
+        known = np.isfinite(off)
+        mean = np.where(known, off, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
+        apart_m[rows] = np.where(known.any(axis=1), mean, np.nan)
     found = {
-        number: float(np.median(apart_m[rows]))
+        number: float(np.median(apart_m[mine]))
         for number in _numbers(seen)
-        if (rows := (seen.body == number) & known.any(axis=1)).any()
+        if (mine := (seen.about.body == number) & np.isfinite(apart_m)).any()
     }
     return min(found, key=lambda number: (found[number], number), default=1)
 
 
 def _recorded_person(
-    number: int, seen: CameraFrames | None, best: SmoothedPeople, fusion_stage: FusionStage, folder: Path | None
+    number: int, seen: Bodies | None, best: SmoothedPeople, fusion_stage: FusionStage, folder: Path | None
 ) -> RecordedPerson:
     """A person without ground truth: the smoothed states and the believed points of each camera."""
     smoothed = from_states(best, fusion_stage.filter.memory_s)
     if seen is None or not len(seen):
         return RecordedPerson(number, SMOOTHED, smoothed.t_ns, smoothed.points_m, (smoothed,))
-    order = np.argsort(seen.capture_ns, kind="stable")
+    order = np.argsort(seen.about.capture_ns, kind="stable")
     batches_of = (order[first : first + _BATCH] for first in range(0, len(order), _BATCH))
     points_m = gather((_select_accepted(seen.rows(rows), best, fusion_stage)[0] for rows in batches_of), folder)
     parts = (points_m[first : first + _BATCH] for first in range(0, len(order), _BATCH))
@@ -393,10 +378,10 @@ def _recorded_person(
     if not shown.any():
         every = ModelPoints(best.p, best.lengths_m, np.ones(len(best), dtype=np.bool_))
         return RecordedPerson(number, SMOOTHED, smoothed.t_ns, every, (smoothed,))
-    t_ns, camera = seen.capture_ns[order], seen.camera[order]
+    t_ns, camera = seen.about.capture_ns[order], seen.about.camera[order]
     cameras = [
         BodyTrack(name, t_ns[mine], CameraPoints(points_m, mine), _HOLD_S)
-        for c, name in enumerate(seen.cameras)
+        for c, name in enumerate(seen.about.cameras)
         for mine in [np.flatnonzero(camera == c)]
         if shown[mine].any()
     ]
@@ -525,7 +510,7 @@ def read_recordings(
     fused, measurements = HumanStates.join(passed), Measurements.join(seen)
     best += smoother.finish() if truth is None else []
     smoothed = SmoothedPeople.of(fused if truth is not None else HumanStates.join(best))
-    of_truth = 0 if truth is None else _nearest_to(truth, as_frames(measurements))
+    of_truth = 0 if truth is None else _nearest_to(truth, Bodies.of(as_frames(measurements)))
     known = np.isfinite(fused.p[:, 0])
     found = {}
     for number in sorted(set(fused.numbers[known].tolist())) or [1]:

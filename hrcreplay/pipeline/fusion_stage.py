@@ -12,7 +12,7 @@ from hrcreplay.human.fusion import inverse_kinematics
 from hrcreplay.human.fusion.vacancy import WatchedArea
 from hrcreplay.human.model import LimitSet
 from hrcreplay.logs.cleaning import PersonMemory, select_person
-from hrcreplay.records import NOBODY, Bools, CameraFrames, Floats, Growing, Ints, Measurements
+from hrcreplay.records import NOBODY, Bools, CameraFrames, Floats, Ints, Measurements
 from hrcreplay.settings.sections import Fusion
 
 
@@ -33,23 +33,6 @@ class Sightings(NamedTuple):
     def others(self) -> CameraFrames:
         """Bodies that are none of the people."""
         return self.everybody.rows((self.person == 0) & (self.everybody.body != NOBODY))
-
-
-class SeenBodies:
-    """All bodies that cameras show in a run, from which the recorded people are made."""
-
-    def __init__(self) -> None:
-        self._people = Growing[CameraFrames]()  # their number as body id
-        self._others = Growing[CameraFrames]()
-
-    def add(self, sightings: Sightings) -> None:
-        """Adds those of some frames; points in the world."""
-        self._people.add(as_frames(sightings.measured))
-        self._others.add(sightings.others)
-
-    def take(self) -> tuple[CameraFrames | None, CameraFrames | None]:
-        """Returns the people and all others, None for no rows; it is empty then, as a long run's take memory."""
-        return self._people.take(), self._others.take()
 
 
 def as_frames(measured: Measurements) -> CameraFrames:

@@ -17,10 +17,11 @@ from hrcreplay.logs.camera_checks import CameraChecks
 from hrcreplay.logs.clocks import delay_text
 from hrcreplay.logs.reader import Log
 from hrcreplay.pipeline.assembly import Follower
-from hrcreplay.pipeline.fusion_stage import FusionStage, SeenBodies
+from hrcreplay.pipeline.fusion_stage import FusionStage
 from hrcreplay.pipeline.people_smoother import PeopleSmoother
 from hrcreplay.pipeline.person_fuser import PersonFuser
 from hrcreplay.pipeline.run_config import RunConfig
+from hrcreplay.pipeline.seen_bodies import SeenBodies
 from hrcreplay.pipeline.stored_volumes import StoredVolumes, select_stored_ticks, store_ticks, store_volumes
 from hrcreplay.pipeline.surroundings import Forecast, PredictionStage, Surroundings
 from hrcreplay.records import (

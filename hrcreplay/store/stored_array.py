@@ -1,14 +1,43 @@
-"""An array in a file, rows of which are read when they are asked for, as all of a long run would fill the memory."""
+"""Arrays of which rows are read when they are asked for, as all of a long run would fill the memory."""
 
 from __future__ import annotations
 
 import os
 import tempfile
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
 from hrcreplay.records import Floats, Ints
+
+
+class Rows(Protocol):
+    """An array, or what gives some of its rows when they are asked for."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Its shape; the first axis is that of the rows."""
+
+    def __getitem__(self, rows: slice | Ints, /) -> Floats:
+        """Some of the rows."""
+
+
+@dataclass(frozen=True)
+class SomeRows:
+    """Some rows of an array as an array of their own."""
+
+    every: Rows
+    mine: Ints  #: (n,) the rows
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Number of these rows, and shape of a row."""
+        return len(self.mine), *self.every.shape[1:]
+
+    def __getitem__(self, rows: slice | Ints) -> Floats:
+        return self.every[self.mine[rows]]
 
 
 class StoredArray:
