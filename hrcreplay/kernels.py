@@ -169,6 +169,7 @@ def _find_template(whole: Callable[..., Any], args: tuple[Any, ...], kws: dict[s
 @contextmanager
 def _locked() -> Iterator[None]:
     """Waits until no other process writes into the folder, and keeps others from it."""
+    folder().mkdir(parents=True, exist_ok=True)
     with (folder() / "lock").open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         yield
@@ -227,17 +228,19 @@ def _sources() -> str:
 
 @cache
 def folder() -> Path:
-    """Folder of the compiled kernels: NUMBA_CACHE_DIR if that is set, else one named by the digest of the sources.
+    """Folder of the compiled kernels, named by the digest of the sources: another version must not read them.
 
-    It lies beside the package, or in the user's cache if that place is not writable.
+    It lies in NUMBA_CACHE_DIR if that is set, else beside the package, or in the user's cache if that place is not
+    writable.
     """
+    name = f"kernels-{_sources()}"
     if chosen := os.environ.get("NUMBA_CACHE_DIR"):
-        return Path(chosen)
+        return Path(chosen) / name
     here = Path(__file__).parent
     beside = here / "__pycache__"
     if not os.access(beside if beside.exists() else here, os.W_OK):
         beside = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hrcreplay"
-    return beside / f"kernels-{_sources()}"
+    return beside / name
 
 
 def forgo(module: str) -> None:

@@ -54,8 +54,18 @@ def test_every_module_with_kernels_is_in_a_room_that_counts() -> None:
     assert [path for path in with_kernels if not any(path.is_relative_to(room) for room in rooms)] == []
 
 
-def test_the_users_own_choice_stands(tmp_path: Path) -> None:
-    assert _cache(Path(hrcreplay.__file__).parent, NUMBA_CACHE_DIR=str(tmp_path)) == str(tmp_path)
+def test_in_the_folder_that_the_user_chose_each_version_has_its_own(tmp_path: Path) -> None:
+    """A kernel of one version that calls one of another would crash the process, or decide as the other version did."""
+    package = tmp_path / "hrcreplay"
+    shutil.copytree(Path(hrcreplay.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
+    chosen = tmp_path / "chosen"
+    before = _cache(package, NUMBA_CACHE_DIR=str(chosen))
+    assert Path(before).parent == chosen
+    kernel = package / "robot" / "control" / "qp_tick.py"
+    kernel.write_text(kernel.read_text() + "\n# another version\n")
+    after = _cache(package, NUMBA_CACHE_DIR=str(chosen))
+    assert Path(after).parent == chosen
+    assert after != before
 
 
 def test_importing_the_package_changes_nothing_of_the_process() -> None:

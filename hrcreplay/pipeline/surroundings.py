@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from hrcreplay.human.model import LimitSet
 from hrcreplay.human.prediction import swept_volumes
 from hrcreplay.kernels import Held
 from hrcreplay.pipeline.batch.ticks import KNOWN, LEFT, TOO_OLD, PeopleAhead, hulls_of
-from hrcreplay.records import BORDER, Floats, HumanStates, SweptVolumes, volume_name
+from hrcreplay.records import BORDER, Floats, HumanStates, Ints, SweptVolumes, volume_name
 from hrcreplay.robot.control.border import Border
 from hrcreplay.robot.control.controllers import Predict
 from hrcreplay.robot.control.separation import Obstacles, join_obstacles, obstacles
@@ -121,7 +121,7 @@ class Surroundings:
         numbers = [1] * len(fresh) if states.person is None else states.person[rows].tolist()
         if self.watched is None or states.nobody_s is None or states.nobody_else_s is None:
             found = join_obstacles(people)
-            return self.numbered(found if all(fresh.tolist()) else replace(found, known=False), numbers)
+            return self.numbered(found if all(fresh.tolist()) else found._replace(known=False), numbers)
         since_s = float(np.where(fresh, states.nobody_else_s[rows], states.nobody_s[rows]).max())
         horizon_s = people[0].horizon_s
         depth_m = self.watched.depth_m(since_s, horizon_s)
@@ -134,11 +134,24 @@ class Surroundings:
         """The volumes of people and what follows them, with their places in ``names_of`` if that is needed."""
         if all(number == 1 for number in numbers):
             return found
-        people, each = np.array(numbers), len(self.prediction.limbs)
-        first = np.where(people == 1, 0, len(self.names) + (people - 2) * each)
-        limbs = (first[:, None] + np.arange(each)).ravel()
-        rest = each + np.arange(len(found.radius_m) - len(limbs))
-        return replace(found, numbers=np.concatenate([limbs, rest]))
+        each = len(self.prediction.limbs)
+        return found._replace(numbers=_places(tuple(numbers), len(self.names), each, len(found.radius_m)))
+
+
+@lru_cache(maxsize=64)
+def _places(people: tuple[int, ...], names: int, each: int, count: int) -> Ints:
+    """(count,) places of the volumes of some people, and of what follows them, as ``Surroundings.names_of`` orders all.
+
+    Args:
+        people: Their numbers.
+        names: Number of names beside one person.
+        each: Number of limbs of a person.
+        count: Number of volumes.
+    """
+    limbs = np.concatenate([(0 if one == 1 else names + (one - 2) * each) + np.arange(each) for one in people])
+    found: Ints = np.concatenate([limbs, each + np.arange(count - len(limbs))])
+    found.setflags(write=False)
+    return found
 
 
 @dataclass
@@ -221,9 +234,11 @@ class Forecast:
 
     def _alone(self, ahead: PeopleAhead, tick: int, horizon_s: float) -> Obstacles:
         """Obstacles of a tick alone, in one kernel: in half the time, and the same numbers."""
-        hulls = hulls_of(self.how, ahead, tick, horizon_s)
+        rows, known = self.rows(tick), bool(ahead.what[tick] == KNOWN)
+        until_s = horizon_s, horizon_s + ahead.latency_s
+        hulls = hulls_of(self.how, ahead.rows, rows.start, rows.stop, until_s, known)
         found = Obstacles(hulls.vertices, hulls.offsets, hulls.radius, hulls.boxes, hulls.known, horizon_s)
-        return self.around.numbered(found, ahead.number[self.rows(tick)].tolist())
+        return self.around.numbered(found, ahead.number[rows].tolist())
 
     def until(self, horizon_s: Floats) -> list[Obstacles]:
         """Obstacles of every tick, each until its own horizon (n,) after it [s]."""

@@ -5,16 +5,18 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
 
 from hrcreplay.commands import replay
 from hrcreplay.human.model import skeleton
+from hrcreplay.human.prediction.sound_volumes import SoundRows
 from hrcreplay.kernels import Held
 from hrcreplay.logs.reader import open_log
 from hrcreplay.pipeline import assembly, stages, surroundings
-from hrcreplay.pipeline.batch.ticks import PeopleAhead, hulls_of
+from hrcreplay.pipeline.batch.ticks import hulls_of
 from hrcreplay.pipeline.run_config import RunConfig, resolve
 from hrcreplay.pipeline.surroundings import Forecast, Surroundings
 from hrcreplay.records import POINTS, HumanStates
@@ -68,9 +70,9 @@ def test_a_tick_alone_is_computed_in_one_kernel_and_has_the_same_numbers(monkeyp
     alone: list[int] = []
     compute = hulls_of
 
-    def listening(how: Held, people: PeopleAhead, tick: int, horizon_s: float) -> TickHulls:
-        alone.append(tick)
-        return compute(how, people, tick, horizon_s)
+    def listening(how: Held, rows: SoundRows, first: int, *given: Any) -> TickHulls:
+        alone.append(first)
+        return compute(how, rows, first, *given)
 
     monkeypatch.setattr(surroundings, "hulls_of", listening)
     for people in (states.rows(slice(200, 260)), crowd(1, 2), crowd(3, 1, 2)):
@@ -84,7 +86,7 @@ def test_a_tick_alone_is_computed_in_one_kernel_and_has_the_same_numbers(monkeyp
             volumes = around.prediction.volumes(people.rows(rows), until_s)
             each = [obstacles(volumes, row, until_s) for row in range(len(volumes))]
             assert_same(forecast.obstacles(tick, until_s), around.obstacles(people, rows, each))
-        assert alone == list(range(len(forecast.t_ns)))
+        assert alone == [forecast.rows(tick).start for tick in range(len(forecast.t_ns))]
 
 
 def test_a_body_that_counts_by_its_points_and_one_partly_seen_have_their_own_horizons() -> None:

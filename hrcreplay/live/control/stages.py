@@ -13,7 +13,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -89,7 +89,7 @@ class Observer:
         if not horizon_s:
             people = _each(self._surroundings.prediction.volumes(look.states, 0.0), 0.0)
         found = self._surroundings.obstacles(look.states, slice(None), people)
-        return found if believed else replace(found, known=False)
+        return found if believed else found._replace(known=False)
 
     def _frames(self, t_ns: int, skeletons: Sequence[bytes]) -> CameraFrames | None:
         for data in skeletons:

@@ -110,7 +110,8 @@ def run_ticks(
     while tick < len(found.status) and people.what[tick] != LEFT:
         start = moving.start
         horizon_s = horizon_after(len(start.stop.q) - 1, rules.ahead)
-        hulls = hulls_of(how, people, tick, horizon_s)
+        rows, known = (people.first[tick], people.first[tick + 1]), people.what[tick] == KNOWN
+        hulls = hulls_of(how, people.rows, *rows, (horizon_s, horizon_s + people.latency_s), known)
         if way.by_qp:
             seen = decide_at_once(arm, grid, rules, static, start, hulls)
             if not seen.decided:
@@ -134,22 +135,22 @@ def run_ticks(
 
 
 @njit(cache=True)
-def hulls_of(how: Held, people: PeopleAhead, tick: int, horizon_s: float) -> TickHulls:
+def hulls_of(how: Held, rows: SoundRows, first: int, last: int, until_s: tuple[float, float], known: bool) -> TickHulls:
     """The volumes of a tick that is not left to Python, as far as they are known.
 
     Args:
         how: ``SoundRules``, and a surface to work with.
-        people: The people of the batch.
-        tick: The tick.
-        horizon_s: Time from the tick on for which they are valid [s].
+        rows: The people of the batch.
+        first: First row of the tick.
+        last: Past its last row.
+        until_s: Time from the tick on for which the volumes are valid, and that with the latency [s].
+        known: Whether all people of the tick are.
     """
-    first, last = people.first[tick], people.first[tick + 1]
-    span_s = np.full(last - first, horizon_s + people.latency_s)
     rules, work = how.value
-    vertices, offsets, radii = sweep_sound(people.rows, first, last, span_s, rules, work)
+    vertices, offsets, radii = sweep_sound(rows, first, last, np.full(last - first, until_s[1]), rules, work)
     radius = radii.reshape(-1)
-    around, known = boxes(vertices, offsets, radius)
-    return TickHulls(vertices, offsets, radius, around, known and people.what[tick] == KNOWN, horizon_s)
+    around, whole = boxes(vertices, offsets, radius)
+    return TickHulls(vertices, offsets, radius, around, whole and known, until_s[0])
 
 
 @njit(cache=True, inner=True)

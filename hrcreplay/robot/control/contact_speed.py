@@ -32,7 +32,7 @@ class ContactSpeeds:
         each = len(self.limbs)
         found = np.full(len(obstacles.radius_m), np.nan)
         for k in range(len(found)):
-            index = obstacles.index(k)
+            index = obstacles.among_all(k)
             if index >= each + self.others:  # of persons 2, 3, ...
                 found[k] = self.limbs[(index - each - self.others) % each]
             elif index < each:
@@ -104,5 +104,5 @@ def select(obstacles: Obstacles, which: Bools) -> Obstacles:
         obstacles.boxes_m[kept],
         obstacles.known,
         obstacles.horizon_s,
-        numbers=np.array([obstacles.index(k) for k in kept.tolist()], dtype=np.int64),
+        numbers=np.array([obstacles.among_all(k) for k in kept.tolist()], dtype=np.int64),
     )

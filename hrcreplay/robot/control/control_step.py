@@ -435,7 +435,7 @@ def _sight(pose: RobotPose, found: NearestLink, obstacles: Obstacles) -> Sight:
         return Sight(pose, pairs, math.nan, -1, -1, 0)
     if math.isnan(surface):
         return Sight(pose, None, math.nan, -1, -1, NO_DISTANCE)
-    return Sight(pose, pairs, max(0.0, surface), obstacles.index(limb), link, 0, max(0.0, -surface))
+    return Sight(pose, pairs, max(0.0, surface), obstacles.among_all(limb), link, 0, max(0.0, -surface))
 
 
 @njit(cache=True)

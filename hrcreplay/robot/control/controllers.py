@@ -168,9 +168,9 @@ class QpController(Controller):
 
     def _proposals(self, seen: Observation, found: QpTick) -> Proposals:
         """The proposals of a tick that the kernel has not decided."""
-        if found.solved:
-            return qp_controller.proposals_of(found.stops, self.settings, held=found.held)
-        return qp_controller.try_again(self._context(seen, found.rate, found.tcp_speed_max), self.settings)
+        context = self._context(seen, found.rate, found.tcp_speed_max)
+        again = qp_controller.propose if found.solved else qp_controller.try_again
+        return again(context, self.settings)
 
     def propose(self, seen: Observation) -> Proposals:
         """The best step by Eq. (66), and the stop after it."""
@@ -269,7 +269,7 @@ class PflController(PathController):
         """The people at the tick: the robot's distances from all of them, and the volumes that it must not touch."""
         seen = super().observe(predict)
         self.speeds = self.settings.contact.speeds(seen.obstacles)  # type: ignore[union-attr]
-        self.beside = [seen.obstacles.index(k) for k in range(len(self.speeds))]
+        self.beside = [seen.obstacles.among_all(k) for k in range(len(self.speeds))]
         return seen._replace(obstacles=select(seen.obstacles, np.isnan(self.speeds)))
 
     def propose(self, seen: Observation) -> Proposals:

@@ -25,7 +25,7 @@ from hrcreplay.robot.control.control_step import (
     reason_to_stand,
 )
 from hrcreplay.robot.control.motion_check import CLEAR, OPENING, RETREAT_SPEED, UNDECIDED, judge
-from hrcreplay.robot.control.qp_controller import Instant, Stops, Target, no_stops, propose_stops, static_ahead_s
+from hrcreplay.robot.control.qp_controller import Instant, Stops, Target, propose_stops, static_ahead_s
 from hrcreplay.robot.control.separation import NearestLink
 from hrcreplay.robot.control.static_obstacles import StaticShapes
 from hrcreplay.robot.kinematics import Arm, RobotPose
@@ -65,8 +65,6 @@ class QpTick(NamedTuple):
     point: ReferencePoint  #: the reference at the next tick
     tcp_speed_max: float  #: speed limit of the TCP on the way to it [m/s]
     solved: bool  #: whether ``row_search`` proves the minimiser of Eq. (66)
-    held: bool  #: whether a row of people or objects holds it
-    stops: Stops  #: the stops after it; empty if it is not solved
     decided: bool  #: False: Python decides
     taken: Taken  #: the motion that the robot executes, if it is decided
     planes: Floats  #: for the next tick, if it is decided
@@ -91,7 +89,7 @@ def decide_at_once(
     pose, finite, nearest = look(arm, q, dq, *hulls, people.radius, people.known, rules.clearance_m)
     s_s, rate, point, cap = follow(grid, arm.chain, moment.s_s, moment.T_world_ref, pose.T_world_tcp, dt_s, rules.waits)
     reason = reason_to_stand(finite, people.known, nearest, rules.certified, rules.retreat_m)
-    solved, held, stops, decided = False, False, no_stops(len(q)), reason != 0
+    solved, decided = False, reason != 0
     taken, planes = go_on(stop, reason, rules.certified), moment.planes
     if not reason:
         retreats = 0.0 < -nearest.surface_m < rules.retreat_m
@@ -102,7 +100,7 @@ def decide_at_once(
         solved, held, stops = propose_stops(arm, rules.qp, now, static)
         if solved and rules.certified:
             decided, taken, planes = _decide(arm, rules, stop, stops, held, people, planes, static)
-    return QpTick(pose, finite, nearest, reason, s_s, rate, point, cap, solved, held, stops, decided, taken, planes)
+    return QpTick(pose, finite, nearest, reason, s_s, rate, point, cap, solved, decided, taken, planes)
 
 
 @njit(cache=True)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache
 from typing import NamedTuple
 
@@ -21,8 +20,7 @@ from hrcreplay.records import Floats, Ints, SweptVolumes
 from hrcreplay.robot.kinematics import RobotPose
 
 
-@dataclass(frozen=True, slots=True)
-class Obstacles:
+class Obstacles(NamedTuple):
     """The swept volumes of one tick: per limb the convex hull of its vertices + a ball. Built once per tick."""
 
     vertices_m: Floats  #: (m, 3) world, limb after limb [m]
@@ -34,7 +32,7 @@ class Obstacles:
     first: int = 0  #: index of the first volume among all possible volumes: the person's limbs, then the walls
     numbers: Ints | None = None  #: (l,) index of each volume among all possible ones; None: from ``first`` on
 
-    def index(self, volume: int) -> int:
+    def among_all(self, volume: int) -> int:
         """Index of one of the volumes among all possible volumes."""
         return self.first + volume if self.numbers is None else int(self.numbers[volume])
 

@@ -77,11 +77,10 @@ def test_a_robot_at_rest_is_certified_outside_and_refused_inside(robot: RobotMod
 
 
 def test_what_is_not_known_or_not_finite_is_refused(robot: RobotModel) -> None:
-    from dataclasses import replace
 
     q, far = np.zeros(6), as_obstacles([_ball(np.array([5.0, 5.0, 5.0]))])
     assert clear(robot, at_rest(q), at_rest(q), far, 0.0, DT_S, NO_PLANES)[0]
-    assert not clear(robot, at_rest(q), at_rest(q), replace(far, known=False), 0.0, DT_S, NO_PLANES)[0]
+    assert not clear(robot, at_rest(q), at_rest(q), far._replace(known=False), 0.0, DT_S, NO_PLANES)[0]
     assert not clear(robot, at_rest(q), at_rest(np.full(6, np.nan)), far, 0.0, DT_S, NO_PLANES)[0]
     beyond = np.where(np.arange(6) == 2, robot.q_max + 1e-6, 0.0)
     assert not clear(robot, at_rest(q), at_rest(beyond), far, 0.0, DT_S, NO_PLANES)[0]
@@ -90,7 +89,7 @@ def test_what_is_not_known_or_not_finite_is_refused(robot: RobotModel) -> None:
         spoiled = far.vertices_m.copy()
         spoiled[vertex, 0] = np.nan
         for known in (NO_PLANES, planes, np.full_like(planes, 3**-0.5)):
-            hidden = replace(far, vertices_m=spoiled)
+            hidden = far._replace(vertices_m=spoiled)
             assert not clear(robot, at_rest(q), at_rest(q), hidden, 0.0, DT_S, known)[0], vertex
 
 

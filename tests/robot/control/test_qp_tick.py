@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import fields, replace
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -135,9 +135,9 @@ def test_a_tick_in_one_kernel_is_the_tick_in_python(
 
 def test_unknown_people_and_nobody_are_those_of_python(robot: RobotModel) -> None:
     path, near = plan_programme(parse_task(TO_AND_FRO), robot), approaching()
-    unknown = replace(near[0], known=False)
-    outside = replace(near[0], horizon_s=0.001)  # no stop ends in time
-    lost = replace(near[0], vertices_m=np.full_like(near[0].vertices_m, np.nan))
+    unknown = near[0]._replace(known=False)
+    outside = near[0]._replace(horizon_s=0.001)  # no stop ends in time
+    lost = near[0]._replace(vertices_m=np.full_like(near[0].vertices_m, np.nan))
     people = [no_obstacles()] * 60 + near[:60] + [unknown] * 20 + [outside] * 20 + [lost] * 20 + near[60:120]
     settings = PlanSettings(Plan(), dt_s=DT_S, stop_s=STOP_S, retreat_m=0.03)
     counts = run(QpController(robot, path, settings), people)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -81,7 +79,7 @@ def beside(robot: RobotModel, runner: QpController, depth_m: float) -> Box:
 
 
 def go(runner: QpController, box: Box, ticks: int) -> list[Step]:
-    seen = replace(as_obstacles([box]), horizon_s=np.inf)
+    seen = as_obstacles([box])._replace(horizon_s=np.inf)
     return [runner.step(lambda _: seen).step for _ in range(ticks)]
 
 

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -108,7 +107,7 @@ def test_the_nearest_pair_is_that_of_all_distances() -> None:
         seen, pose = obstacles(volumes(limbs), 0), arm(*rng.normal(size=(5, 2, 3)) * 0.4)
         radius, ball = rng.uniform(0.05, 0.1, 5), rng.uniform(0.0, 0.2, 6)
         ball.flags.writeable = False  # as radii are: so the kernel is that of a run
-        _, surface, link, limb = measured(pose, replace(seen, radius_m=ball), radius, 0.05)
+        _, surface, link, limb = measured(pose, seen._replace(radius_m=ball), radius, 0.05)
         expected = by_coal(pose, seen) - radius[:, None] - ball - 0.05
         assert link * 6 + limb == np.argmin(expected)
         assert surface == pytest.approx(expected.min(), abs=1e-10)
@@ -139,7 +138,7 @@ def test_a_pair_whose_bounds_do_not_meet_counts_with_the_lower_one(monkeypatch: 
         return low - 0.1, high + 0.1, near
 
     monkeypatch.setattr(module, "distances", open_ended)
-    seen = replace(seen, radius_m=np.zeros(2))
+    seen = seen._replace(radius_m=np.zeros(2))
     found = measure.py_func(pose.ends_m, np.zeros(1), seen.vertices_m, seen.offsets, seen.radius_m, 0.0)
     np.testing.assert_allclose(found.pairs.distance_m, np.sqrt([[3.0, 12.0]]) - 0.1, rtol=0, atol=1e-12)
     assert found[1:] == pytest.approx((np.sqrt(3.0) - 0.1, 0, 0))

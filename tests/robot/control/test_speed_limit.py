@@ -136,7 +136,7 @@ def test_a_certified_stop_goes_on_above_the_limit(robot: RobotModel) -> None:
     rng = np.random.default_rng(8)
     state = moving(robot, rng, 0.8)
     going = stop_straight(state.q, state.dq, robot.ddq_max, DT_S)
-    everywhere = replace(NOBODY, known=False)
+    everywhere = NOBODY._replace(known=False)
     taken, _ = decide(robot, going, [Proposal(going, 0)], everywhere, 1.0, NO_PLANES, SETTINGS)
     assert taken.status == BRAKING
     assert taken.certified
