@@ -258,7 +258,7 @@ def facts(record: Record, tick: int) -> dict[str, Any] | None:
         return None
     robot, settings, row = record.controller.robot, record.controller.settings, record.motion.iloc[tick]
     links, obstacles = [segment.name for segment in robot.segments], context.seen.obstacles
-    limbs = [record.names[obstacles.index(k)] for k in range(len(obstacles.radius_m))]  # of the hulls of this tick
+    limbs = [record.names[obstacles.among_all(k)] for k in range(len(obstacles.radius_m))]  # of the hulls of this tick
     people = record.people(tick)
     found: dict[str, Any] = {
         "at_s": float(row["t_ns"] - record.motion["t_ns"].iloc[0]) * 1e-9,

@@ -77,7 +77,7 @@ def test_a_watched_area_keeps_the_walls_after_all_people_and_their_names() -> No
     people = crowd(1, 2)
     people = replace(people, nobody_s=np.full(4, 5.0), nobody_else_s=np.full(4, 0.1))
     found, names = Forecast(around, people).obstacles(0, HORIZON_S), around.names_of(2)
-    assert [names[found.index(k)] for k in range(len(found.radius_m))] == [
+    assert [names[found.among_all(k)] for k in range(len(found.radius_m))] == [
         *BODY,
         *(f"{limb} of person 2" for limb in BODY),
         *(BORDER,) * 4,
@@ -86,7 +86,7 @@ def test_a_watched_area_keeps_the_walls_after_all_people_and_their_names() -> No
     age_s[1] = 0.4  # person 2 is unknown, but neither inside nor able to be deeper inside than the walls
     lost = replace(people, frame_age_s=age_s, nobody_s=np.full(4, 0.2))
     found = Forecast(around, lost).obstacles(0, HORIZON_S)
-    assert [names[found.index(k)] for k in range(len(found.radius_m))] == [*BODY, *(BORDER,) * 4]
+    assert [names[found.among_all(k)] for k in range(len(found.radius_m))] == [*BODY, *(BORDER,) * 4]
     assert found.known
     walls = np.split(found.vertices_m, found.offsets[1:-1])[len(BODY) :]
     deep_m = 0.1 + 1.6 * (0.2 + HORIZON_S)
