@@ -38,7 +38,7 @@ from tests.live.sessions import children
 PLACES: dict[str, tuple[Any, str]] = {
     "fusion": (Observer, "update_perception"),
     "controller": (QpController, "step"),
-    "compiled tick": (controllers, "decide_at_once"),
+    "compiled tick": (controllers, "decide_held"),
     "packets": (session_controller, "decode_robot"),
     "conversation": (EgmSession, "classify_all"),
     "reply": (EgmSession, "reply"),
