@@ -16,7 +16,7 @@ from hrcreplay.commands import replay
 from hrcreplay.commands.report import summary
 from hrcreplay.evaluation import recorded_person
 from hrcreplay.evaluation.judging import read_recorded_people
-from hrcreplay.evaluation.recorded_person import CameraPoints
+from hrcreplay.evaluation.recorded_person import CameraPoints, at_instants
 from hrcreplay.geometry.distances import segment_distance
 from hrcreplay.logs.reader import open_log
 from hrcreplay.logs.writer import LogWriter
@@ -239,6 +239,11 @@ def test_people_are_the_same_from_files_and_in_memory(
     for track, again in zip(plain.tracks, stored.tracks, strict=True):
         np.testing.assert_array_equal(track.t_ns, again.t_ns)
         np.testing.assert_array_equal(track.points_m[:], again.points_m[:])
+    if truth:
+        (true,) = (one for one in plain.people if one.source == "ground truth")
+        (other,) = (one for one in plain.people if one.source != "ground truth")
+        apart = np.linalg.norm(at_instants(true.t_ns, true.points_m, other.t_ns, 0.1) - other.points_m[:], axis=2)
+        assert np.nanmedian(apart) > 2.0, "the ground truth is that of the worker, not of the bystander"
     in_files = sum(path.stat().st_size for path in kept.iterdir())
     assert in_files >= sum(8 * one.points_m[:].size for one in stored.people)
     assert len(pickle.dumps(stored)) < 0.2 * len(pickle.dumps(plain))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from hrcreplay.geometry.distances import distances
+from hrcreplay.reporting import replay_scene
 from hrcreplay.reporting.page import report_page
 from hrcreplay.reporting.page.replay_page import replay_part, touching_pairs
 from hrcreplay.reporting.replay_scene import ReplayScene
@@ -411,3 +412,15 @@ def test_a_table_wider_than_a_phone_says_that_it_scrolls(tab: Tab) -> None:
     assert any(wide for wide, _ in told)
     assert all(wide == says for wide, says in told)
     tab.look(1280, 900)
+
+
+def test_a_long_run_tells_its_rates_in_short_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert PROGRAM is not None
+    monkeypatch.setattr(replay_scene, "WHOLE_S", 1.2)  # so that 8 s are as more than an hour: 25 Hz by 7
+    run = moving_run(8.0)
+    page = report_page.render(run, metrics_of(run), tmp_path, replay=replay_part(moving_scene(run)))
+    (tmp_path / "report.html").write_text(page, encoding="utf-8")
+    with opened(PROGRAM, tmp_path / "profile") as tab:
+        tab.open(tmp_path / "report.html", 1280, 900)
+        said = tab.evaluate("document.querySelector('.volumes-rate').textContent")
+    assert said == "The volumes are shown 5 times a second, robot and person 3.6 times."

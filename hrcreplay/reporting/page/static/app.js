@@ -296,7 +296,7 @@ export async function start(root) {
   view.home();
   const { rate_hz } = data.volumes;
   $(".volumes-rate").textContent = rate_hz
-    ? `The volumes are shown ${rate_hz} times a second, robot and person ${header.rate_hz} times.`
+    ? `The volumes are shown ${rate_hz} times a second, robot and person ${+header.rate_hz.toFixed(1)} times.`
     : "The volumes of this run do not fit on the page: occupancy.parquet holds them.";
   choose(state.method);
   root.classList.add("replay-ready");
