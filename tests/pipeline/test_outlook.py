@@ -75,9 +75,10 @@ def test_a_tick_alone_is_computed_in_one_kernel_and_has_the_same_numbers(monkeyp
         return compute(how, rows, first, *given)
 
     monkeypatch.setattr(surroundings, "hulls_of", listening)
-    for people in (states.rows(slice(200, 260)), crowd(1, 2), crowd(3, 1, 2)):
+    late = replace(STAGE, settings=STAGE.settings.model_copy(update={"latency_s": 0.05}))
+    for people, stage in ((states.rows(slice(200, 260)), STAGE), (crowd(1, 2), late), (crowd(3, 1, 2), STAGE)):
         age_s = np.where(np.arange(len(people)) % 7 == 3, 9.0, people.frame_age_s)
-        around, people = Surroundings(STAGE, fresh_s=0.3), replace(people, frame_age_s=age_s)
+        around, people = Surroundings(stage, fresh_s=0.3), replace(people, frame_age_s=age_s)
         forecast = Forecast(around, people)
         horizon_s = np.random.default_rng(4).uniform(0.0, 0.4, len(forecast.t_ns))
         alone.clear()

@@ -255,3 +255,20 @@ def test_picture_shows_the_nearer_solid_and_the_area_of_a_ball() -> None:
         assert rim[2] > 0.5
         assert image[2, 2, 3] == 0.0
         assert (image[..., 3] > 0).mean() == pytest.approx(np.pi * 0.4**2, rel=0.08)
+
+
+def test_the_window_of_a_path_holds_the_programme_the_robot_and_its_base() -> None:
+    run = make_run(12.0)
+    assert run.motion is not None
+    base = np.eye(4)
+    base[:3, 3] = 0.1, -0.9, 0.3
+    above, side = planning.path(run.motion, None, T0_NS, base).axes[:2]
+    for ax, (x, y) in ((above, "xy"), (side, "xz")):
+        for what in ("ref", "tcp"):
+            seen = (run.motion[f"{what}_{axis}"].to_numpy(dtype=float) for axis in (x, y))
+            for values, (low, high) in zip(seen, (ax.get_xlim(), ax.get_ylim()), strict=True):
+                assert low < values.min()
+                assert values.max() < high
+        at = dict(zip("xyz", base[:3, 3].tolist(), strict=True))
+        assert ax.get_xlim()[0] < at[x] < ax.get_xlim()[1]
+        assert ax.get_ylim()[0] < at[y] < ax.get_ylim()[1]

@@ -130,3 +130,10 @@ def test_a_programme_that_only_stands_has_no_pace() -> None:
     found = metrics_of(held)
     assert found["plan_progress_share"]["value"] == 0.0
     assert found["plan_time_lost_s"]["value"] == pytest.approx(found["span_s"]["value"])
+
+
+def test_ticks_at_which_the_robot_is_not_known_are_left_out() -> None:
+    whole = table(CLOCK_S, at(0.8 * CLOCK_S))
+    gaps = whole.copy()
+    gaps.loc[gaps.index % 5 == 3, ["tcp_x", "tcp_y", "tcp_z"]] = np.nan
+    assert share(gaps) == pytest.approx(share(whole), abs=0.005)
