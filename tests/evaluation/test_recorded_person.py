@@ -16,7 +16,7 @@ from hrcreplay.commands import replay
 from hrcreplay.commands.report import summary
 from hrcreplay.evaluation import recorded_person
 from hrcreplay.evaluation.judging import read_recorded_people
-from hrcreplay.evaluation.recorded_person import CameraPoints, at_instants
+from hrcreplay.evaluation.recorded_person import CameraPoints, SmoothedPeople, at_instants
 from hrcreplay.geometry.distances import segment_distance
 from hrcreplay.logs.reader import open_log
 from hrcreplay.logs.writer import LogWriter
@@ -252,3 +252,16 @@ def test_people_are_the_same_from_files_and_in_memory(
 def test_a_report_leaves_no_file_of_the_people(beside: Path, tmp_path: Path) -> None:
     reported(beside, tmp_path / "run", *BLIND)
     assert [path.name for path in (tmp_path / "run").iterdir() if path.name.startswith(".")] == []
+
+
+def test_a_smoothed_person_has_the_rows_of_its_number() -> None:
+    rng, person = np.random.default_rng(6), np.array([1, 2, 2, 1, 3, 2])
+    t_ns, used = np.array([0, 0, 4, 4, 4, 8]), np.array([True, False, True, True, False, True])
+    people = SmoothedPeople(t_ns, rng.normal(size=(6, 13)), rng.normal(size=(6, 7)), used, person)
+    for number in (1, 2, 3):
+        one, mine = people.of_person(number), person == number
+        assert len(one) == mine.sum()
+        assert one.person is None
+        for got, want in ((one.t_ns, t_ns), (one.p[:], people.p[:]), (one.lengths_m[:], people.lengths_m[:])):
+            np.testing.assert_array_equal(got, want[mine])
+        assert one.used.tolist() == used[mine].tolist()

@@ -11,6 +11,7 @@ import pytest
 
 from hrcreplay.records import JOINTS
 from hrcreplay.reporting.metrics import series
+from hrcreplay.reporting.metrics.fusion import frames_of
 from hrcreplay.reporting.metrics.planning import add_plan, cycles, waited_s
 from hrcreplay.reporting.metrics.series import MetricTable, path_feet
 from hrcreplay.store.run_folder import Run
@@ -371,3 +372,13 @@ def test_the_papers_numbers_are_labelled_as_the_papers(found: dict[str, dict[str
     assert found["paper_stationary_share_scaling"]["value"] == 0.8644
     assert found["paper_deviation_m"]["value"] == 0.221
     assert all("the paper prints" in m["meaning"] for n, m in found.items() if n.startswith("paper_"))
+
+
+def test_frames_of_a_camera_come_in_the_order_of_capture() -> None:
+    measurements = frame_of(make_run(2.0).measurements)
+    mixed = measurements.iloc[np.random.default_rng(8).permutation(len(measurements))].reset_index(drop=True)
+    for camera in sorted(set(measurements["camera"])):
+        found, want = frames_of(mixed, camera), measurements[measurements["camera"] == camera]
+        want = want.sort_values("capture_ns")
+        assert found["capture_ns"].tolist() == want["capture_ns"].tolist()
+        np.testing.assert_array_equal(found[list(JOINTS)].to_numpy(), want[list(JOINTS)].to_numpy())
