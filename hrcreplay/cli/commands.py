@@ -13,11 +13,14 @@ import io
 import json
 import os
 import platform
+import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
 from pathlib import Path
+from types import FrameType
 from typing import Annotated, Any, get_type_hints
 
 import typer
@@ -27,6 +30,10 @@ from hrcreplay.version import __version__
 
 #: glibc's limit for arrays that go back when they are freed; by itself it grows with them. A lower one costs time.
 _MMAP, _M_MMAP_THRESHOLD, _LARGE_BYTES = "MALLOC_MMAP_THRESHOLD_", -3, 1_000_000
+
+#: How the modules begin whose functions compiled code calls, those of named tuples included; and the time after which
+#: a signal that came in one of them comes again [s].
+_CALLED_BY_KERNELS, _AGAIN_S = ("numba", "llvmlite", "ctypes", "namedtuple_"), 0.005
 
 #: Command -> calls that its help shows.
 EXAMPLES: dict[str, tuple[str, ...]] = {
@@ -120,11 +127,37 @@ def _with_messages(function: Callable[..., Any]) -> Callable[..., Any]:
 @contextlib.contextmanager
 def interruptible() -> Iterator[None]:
     """Says 'interrupted' at Ctrl-C instead of a traceback, and exits as shells expect it."""
+    own = threading.current_thread() is threading.main_thread() and (
+        signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    )
     try:
+        if own:
+            signal.signal(signal.SIGINT, interrupt)
         yield
     except KeyboardInterrupt:
         sys.stderr.write("hrcreplay: interrupted\n")
         sys.exit(EXIT_INTERRUPTED)
+    finally:
+        if own:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def interrupt(number: int, frame: FrameType | None) -> None:
+    """Raises KeyboardInterrupt, but not in Python functions that compiled code calls: it would be lost, or a crash.
+
+    Kernels are loaded by callbacks, and convert their results by such functions. Then the signal comes again a little
+    later.
+
+    Raises:
+        KeyboardInterrupt: No such function is under way.
+    """
+    while frame is not None and (name := str(frame.f_globals.get("__name__"))).partition(".")[0] != "hrcreplay":
+        if name.startswith(_CALLED_BY_KERNELS):
+            main = threading.main_thread().ident
+            threading.Timer(_AGAIN_S, signal.pthread_kill, (main, number)).start()
+            return
+        frame = frame.f_back
+    raise KeyboardInterrupt
 
 
 @contextlib.contextmanager
