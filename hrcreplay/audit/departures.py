@@ -16,7 +16,8 @@ import numpy as np
 from hrcreplay.audit import baselines
 from hrcreplay.audit.log_audit import SHORTER_S
 from hrcreplay.evaluation.containment import RecordedFuture, body_radii_m, check_containment, recorded_future
-from hrcreplay.evaluation.recorded_person import TRUTH, Recording
+from hrcreplay.evaluation.recorded_person import TRUTH
+from hrcreplay.evaluation.recording import Recording
 from hrcreplay.geometry.inflated_hull import InflatedHull, union_volume_m3
 from hrcreplay.human.model import Departure
 from hrcreplay.human.prediction.swept_volumes import limb_radii

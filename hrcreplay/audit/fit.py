@@ -21,7 +21,8 @@ from hrcreplay.audit.departures import EXACT, LimbDepartures, capsules_m3, depar
 from hrcreplay.audit.fit_limits import Fit, Futures
 from hrcreplay.audit.measures import Estimate, block_ticks, resample
 from hrcreplay.errors import LogError, SettingsError
-from hrcreplay.evaluation.recorded_person import SMOOTHED, TRUTH, Recording, read_recording
+from hrcreplay.evaluation.recorded_person import SMOOTHED, TRUTH
+from hrcreplay.evaluation.recording import Recording, read_recording
 from hrcreplay.human.model import Departure, LimitSet
 from hrcreplay.human.prediction.velocity_tube import FASTEST_M_PER_S
 from hrcreplay.limits import load_limits, write_limits

@@ -21,7 +21,7 @@ from hrcreplay.evaluation.containment import (
     recorded_future,
     select_rows,
 )
-from hrcreplay.evaluation.recorded_person import Recording, read_recordings
+from hrcreplay.evaluation.recording import Recording, read_recordings
 from hrcreplay.human.model import LimitSet
 from hrcreplay.human.prediction import swept_volumes
 from hrcreplay.human.prediction.swept_volumes import Reach, limb_radii

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from hrcreplay.evaluation.recorded_person import LIMB_POINTS, Recording
+from hrcreplay.evaluation.recorded_person import LIMB_POINTS
+from hrcreplay.evaluation.recording import Recording
 from hrcreplay.human.model import SHOWN_BY
 from hrcreplay.records import POINTS, Floats, Ints, find_neighbours
 from hrcreplay.reporting.metrics.series import difference

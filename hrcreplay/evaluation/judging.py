@@ -22,7 +22,8 @@ from hrcreplay.evaluation.contact import (
     compute_own_coverage,
     write_rows,
 )
-from hrcreplay.evaluation.recorded_person import BodyTrack, RecordedPeople, SmoothedPeople, gather, read_people
+from hrcreplay.evaluation.recorded_person import BodyTrack, RecordedPeople, SmoothedPeople
+from hrcreplay.evaluation.recording import gather, read_people
 from hrcreplay.evaluation.severity import severity_table
 from hrcreplay.human.model import PARTS
 from hrcreplay.logs.reader import Log

@@ -9,7 +9,8 @@ import pytest
 
 from hrcreplay.audit.departures import LimbDepartures, departures
 from hrcreplay.commands import replay
-from hrcreplay.evaluation.recorded_person import CAMERAS, TRUTH, Recording
+from hrcreplay.evaluation.recorded_person import CAMERAS, TRUTH
+from hrcreplay.evaluation.recording import Recording
 from hrcreplay.human.model import Departure, skeleton
 from hrcreplay.pipeline import assembly
 from hrcreplay.pipeline.run_config import resolve

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from hrcreplay.audit.log_audit import joint_travel, joints_inside
-from hrcreplay.evaluation import recorded_person
+from hrcreplay.evaluation import recorded_person, recording
 from hrcreplay.evaluation.containment import RecordedFuture, check_containment, recorded_future
-from hrcreplay.evaluation.recorded_person import Recording, SmoothedPeople
+from hrcreplay.evaluation.recorded_person import SmoothedPeople
+from hrcreplay.evaluation.recording import Recording
 from hrcreplay.human.prediction import swept_volumes
 from hrcreplay.records import BODY, DOF, JOINTS, LIMBS, POINTS, Floats, HumanStates, Measurements, SweptVolumes
 from tests.human.people import states
@@ -102,9 +103,7 @@ def test_every_camera_and_the_limbs_flesh_decide_whether_a_volume_held() -> None
     arm = LIMBS.index("LLA")
     for cameras, farthest_m in (([0], 0.0), ([1], 0.1), ([0, 1], 0.1)):
         mine = np.isin(seen.camera, cameras)
-        source, at_ns, points_m = recorded_person._recorded_points(
-            seen.rows(mine), both[mine], SmoothedPeople.of(people)
-        )
+        source, at_ns, points_m = recording._recorded_points(seen.rows(mine), both[mine], SmoothedPeople.of(people))
         assert source == recorded_person.CAMERAS
         future = recorded_future(at_ns, points_m, people, 0.4)
         outcome = check_containment(_balls(people, 0.12), future, dict.fromkeys(BODY, 0.05), np.array([False]))

@@ -14,7 +14,7 @@ import pytest
 from hrcreplay.audit import metrics as audit_metrics
 from hrcreplay.audit import recorded_motion
 from hrcreplay.commands import audit
-from hrcreplay.evaluation import recorded_person
+from hrcreplay.evaluation import recorded_person, recording
 from hrcreplay.evaluation.recorded_person import SmoothedPeople
 from hrcreplay.limits import load_limits
 from hrcreplay.logs.writer import LogWriter
@@ -61,7 +61,7 @@ def test_a_teleport_is_thrown_out_and_a_squat_is_not() -> None:
     p = np.zeros((4, DOF))
     p[:, [4, 8]], p[:, [7, 11]] = 0.2, 2.5
     best = replace(best, p=p, t_ns=frames(points).capture_ns)
-    believed, counts = recorded_person._select_accepted(_seen(points), SmoothedPeople.of(best), _eyes())
+    believed, counts = recording._select_accepted(_seen(points), SmoothedPeople.of(best), _eyes())
     gone: Bools = np.asarray(np.isfinite(points).all(axis=2) & np.isnan(believed).any(axis=2))
     assert [POINTS[k] for k in np.flatnonzero(gone[1])] == ["wrist_l"]
     assert [POINTS[k] for k in np.flatnonzero(gone[3])] == ["pelvis"]
@@ -108,7 +108,7 @@ def test_what_has_no_confidence_was_not_seen_and_does_not_jump() -> None:
     p = np.zeros((6, DOF))
     p[:, [4, 8]], p[:, [7, 11]] = 0.2, 2.5
     best = replace(best, p=p, t_ns=seen.capture_ns)
-    believed, counts = recorded_person._select_accepted(
+    believed, counts = recording._select_accepted(
         replace(_seen(points), confidence=confidence), SmoothedPeople.of(best), _eyes()
     )
     assert np.isnan(believed[:, hand]).all()
@@ -132,7 +132,7 @@ def test_shoulders_that_were_not_seen_hold_no_pelvis() -> None:
     p = np.zeros((2, DOF))
     p[:, [4, 8]], p[:, [7, 11]] = 0.2, 2.5
     best = replace(best, p=p, t_ns=frames(points).capture_ns)
-    believed, _ = recorded_person._select_accepted(
+    believed, _ = recording._select_accepted(
         replace(_seen(points), confidence=confidence), SmoothedPeople.of(best), _eyes()
     )
     assert np.isfinite(believed[:, POINTS.index("pelvis"), 0]).tolist() == [True, False]
@@ -150,7 +150,7 @@ def test_a_limb_first_moves_when_one_of_its_ends_is_ten_centimetres_away() -> No
     points[58, POINTS.index("hip_l")] += [0.2, 0.0, 0.0]
     t_ns = 1_000_000_000 + 33_000_000 * np.arange(60)
     best = states(np.zeros((4, DOF)), np.zeros((4, DOF)))
-    recorded = recorded_person.Recording(best, t_ns, points, best.t_ns, best.p, recorded_person.CAMERAS, {})
+    recorded = recording.Recording(best, t_ns, points, best.t_ns, best.p, recorded_person.CAMERAS, {})
     found = recorded_motion.first_movements_ns(recorded)
     assert {limb: at for limb, at in found.items() if at is not None} == {"LRA": t_ns[40], "LEGS": t_ns[58]}
 
@@ -175,9 +175,7 @@ def test_errors_are_told_in_their_standard_deviations() -> None:
     fused = replace(fused, p_std=np.full((n, DOF), 0.02), v_std=np.full((n, DOF), 0.25), unseen_s=unseen)
     gap = (t_ns > 5_000_000_000) & (t_ns < 5_200_000_000)
     joints = swing(t_ns)[0]
-    recorded = recorded_person.Recording(
-        fused, t_ns[~gap], standing(1), t_ns[~gap], joints[~gap], recorded_person.TRUTH, {}
-    )
+    recorded = recording.Recording(fused, t_ns[~gap], standing(1), t_ns[~gap], joints[~gap], recorded_person.TRUTH, {})
     errors = recorded_motion.errors_in_deviations(recorded, np.arange(n))
     inside_gap = (at_ns > 5_030_000_000) & (at_ns < 5_170_000_000)
     assert np.isnan(errors[:, inside_gap]).all()

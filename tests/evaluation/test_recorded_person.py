@@ -14,7 +14,7 @@ import pytest
 
 from hrcreplay.commands import replay
 from hrcreplay.commands.report import summary
-from hrcreplay.evaluation import recorded_person
+from hrcreplay.evaluation import recording
 from hrcreplay.evaluation.judging import read_recorded_people
 from hrcreplay.evaluation.recorded_person import CameraPoints, SmoothedPeople, at_instants
 from hrcreplay.geometry.distances import segment_distance
@@ -219,7 +219,7 @@ def test_people_are_the_same_from_files_and_in_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, truth: bool
 ) -> None:
     """Two people, in batches that end within the recording; the files hold what is large."""
-    monkeypatch.setattr(recorded_person, "_BATCH", 37)
+    monkeypatch.setattr(recording, "_BATCH", 37)
     ran = replay.run("fuse", rewritten(tmp_path / "log.mcap", bystander=True, truth=truth), out=tmp_path / "run")
     run_config, kept = resolve("report", ran), tmp_path / "kept"
     log = open_log(run_config.log, run_config.settings.logs)

@@ -20,7 +20,8 @@ from scipy.spatial.transform import Rotation
 
 from hrcreplay.commands import compare, explain, replay, report
 from hrcreplay.errors import LogError, SettingsError
-from hrcreplay.evaluation.recorded_person import RecordedPeople, SmoothedPeople, read_people
+from hrcreplay.evaluation.recorded_person import RecordedPeople, SmoothedPeople
+from hrcreplay.evaluation.recording import read_people
 from hrcreplay.human.model import part_radii
 from hrcreplay.logs.reader import open_log
 from hrcreplay.logs.writer import LogWriter

@@ -17,7 +17,8 @@ import numpy as np
 from scipy.optimize import minimize
 
 from hrcreplay.audit.recorded_motion import errors_in_deviations
-from hrcreplay.evaluation.recorded_person import TRUTH, fuse_stretches, read_recording
+from hrcreplay.evaluation.recorded_person import TRUTH
+from hrcreplay.evaluation.recording import fuse_stretches, read_recording
 from hrcreplay.human.fusion.fuse import Trace
 from hrcreplay.human.fusion.reported_deviations import FITTED, KIND
 from hrcreplay.logs.reader import open_log

@@ -23,7 +23,8 @@ import pandas as pd
 
 from hrcreplay.commands import replay
 from hrcreplay.evaluation.containment import body_radii_m
-from hrcreplay.evaluation.recorded_person import LIMB_POINTS, read_recordings
+from hrcreplay.evaluation.recorded_person import LIMB_POINTS
+from hrcreplay.evaluation.recording import read_recordings
 from hrcreplay.human.prediction.swept_volumes import Predictor, PreparedPerson
 from hrcreplay.logs.reader import open_log
 from hrcreplay.pipeline import assembly

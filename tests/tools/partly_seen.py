@@ -22,7 +22,7 @@ import numpy as np
 
 from hrcreplay.commands import replay
 from hrcreplay.evaluation.containment import body_radii_m, check_containment, recorded_future
-from hrcreplay.evaluation.recorded_person import Recording, read_recording
+from hrcreplay.evaluation.recording import Recording, read_recording
 from hrcreplay.human.prediction import shown_points
 from hrcreplay.human.prediction.velocity_tube import PEOPLES_SPEEDS
 from hrcreplay.logs.reader import Log, open_log
