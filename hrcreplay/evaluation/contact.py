@@ -25,25 +25,10 @@ from hrcreplay.geometry.distances import nearest_pair, protrusion_m
 from hrcreplay.human.model import LEG_PARTS, PARTS, part_radii
 from hrcreplay.pipeline.run_config import RunConfig
 from hrcreplay.pipeline.surroundings import PredictionStage
-from hrcreplay.records import (
-    ALLOWING_CONTACT,
-    BODY,
-    UNGUARDED,
-    Bools,
-    Floats,
-    HumanStates,
-    Ints,
-    SweptVolume,
-)
+from hrcreplay.records import ALLOWING_CONTACT, BODY, UNGUARDED, Bools, Floats, HumanStates, Ints, SweptVolume
 from hrcreplay.robot.model import LinkMotion, RobotModel
 from hrcreplay.robot.recorded import CapsuleSample, RecordedCapsules
-from hrcreplay.store.columns import (
-    Columns,
-    contact_columns,
-    person_columns,
-    read_states,
-    read_states_at,
-)
+from hrcreplay.store.columns import Columns, contact_columns, person_columns, read_states, read_states_at
 from hrcreplay.store.run_folder import arrow_table
 from hrcreplay.store.stored_table import RunTable, StoredTable, text_column
 

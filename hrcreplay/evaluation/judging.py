@@ -33,20 +33,10 @@ from hrcreplay.pipeline.person_fuser import PersonFuser
 from hrcreplay.pipeline.run_config import RunConfig
 from hrcreplay.pipeline.second_process import read_apart, write_apart
 from hrcreplay.pipeline.seen_bodies import SeenBodies
-from hrcreplay.records import (
-    JOINTS,
-    LENGTHS,
-    RECORDED,
-    Floats,
-    HumanStates,
-    Ints,
-)
+from hrcreplay.records import JOINTS, LENGTHS, RECORDED, Floats, HumanStates, Ints
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.recorded import RecordedCapsules
-from hrcreplay.store.columns import (
-    Columns,
-    body_columns,
-)
+from hrcreplay.store.columns import Columns, body_columns
 from hrcreplay.store.memory import release_freed_memory
 from hrcreplay.store.run_folder import RunWriter, TableWriter
 from hrcreplay.store.stored_table import StoredTable

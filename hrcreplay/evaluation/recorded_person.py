@@ -12,14 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from hrcreplay.human.model import part_axes, skeleton
-from hrcreplay.records import (
-    POINTS,
-    Bools,
-    Floats,
-    HumanStates,
-    Ints,
-    find_neighbours,
-)
+from hrcreplay.records import POINTS, Bools, Floats, HumanStates, Ints, find_neighbours
 from hrcreplay.store.stored_array import Rows, SomeRows
 
 TRUTH, CAMERAS, SMOOTHED = "ground truth", "camera points", "smoothed estimate"

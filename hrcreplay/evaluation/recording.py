@@ -34,16 +34,7 @@ from hrcreplay.pipeline.people_smoother import PeopleSmoother
 from hrcreplay.pipeline.person_fuser import PersonFuser
 from hrcreplay.pipeline.seen_bodies import Bodies, SeenBodies
 from hrcreplay.pipeline.stages import batches
-from hrcreplay.records import (
-    LENGTHS,
-    POINTS,
-    Bools,
-    CameraFrames,
-    Floats,
-    HumanStates,
-    Ints,
-    Measurements,
-)
+from hrcreplay.records import LENGTHS, POINTS, Bools, CameraFrames, Floats, HumanStates, Ints, Measurements
 from hrcreplay.store.stored_array import Rows, StoredArray
 
 #: Points outside the model -> the point to which they are attached and the maximum length of that bone [m].

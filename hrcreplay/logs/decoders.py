@@ -16,16 +16,7 @@ import numpy as np
 
 from hrcreplay.errors import LogError
 from hrcreplay.logs import presets
-from hrcreplay.logs.messages import (
-    METRES,
-    Message,
-    RawSkeleton,
-    Undecodable,
-    camera_of,
-    missing_body,
-    nobody,
-    stamp_ns,
-)
+from hrcreplay.logs.messages import METRES, Message, RawSkeleton, Undecodable, camera_of, missing_body, nobody, stamp_ns
 from hrcreplay.records import NOBODY, POINTS, Floats
 from hrcreplay.settings.sections import Decoder
 

@@ -15,14 +15,7 @@ from hrcreplay.logs import joints, log_files, messages, plausibility, presets
 from hrcreplay.logs.capsule_track import CapsuleTrack, find_capsules, read_capsules
 from hrcreplay.logs.cleaning import DEFECTS, STILL_M, STILL_S, Cleaner
 from hrcreplay.logs.clocks import ArrivalOrder, CameraClock, clock_remarks
-from hrcreplay.logs.decoders import (
-    DECODABLE,
-    GenericDecoder,
-    OwnDecoder,
-    describe_arrays,
-    frame_of,
-    points_lacking,
-)
+from hrcreplay.logs.decoders import DECODABLE, GenericDecoder, OwnDecoder, describe_arrays, frame_of, points_lacking
 from hrcreplay.logs.joints import JointReading, JointTopic, JointTrack
 from hrcreplay.logs.log_files import Header, LogFiles, Truth, open_source
 from hrcreplay.logs.markers import MARKER_TYPE, MarkerDecoder, MarkerLayout, survey_markers

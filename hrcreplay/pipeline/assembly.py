@@ -26,13 +26,7 @@ from hrcreplay.pipeline.planner import Planner
 from hrcreplay.pipeline.robot_mass import contact_speeds
 from hrcreplay.pipeline.run_config import RunConfig, UrdfFiles, link_capsules
 from hrcreplay.pipeline.surroundings import PredictionStage, Surroundings, WatchedBorder
-from hrcreplay.records import (
-    ALLOWING_CONTACT,
-    RECORDED,
-    UNGUARDED,
-    AxisFrame,
-    Floats,
-)
+from hrcreplay.records import ALLOWING_CONTACT, RECORDED, UNGUARDED, AxisFrame, Floats
 from hrcreplay.robot.control.border import Border
 from hrcreplay.robot.control.control_step import PlanSettings
 from hrcreplay.robot.control.controllers import CONTROLLERS, Controller

@@ -24,16 +24,7 @@ from hrcreplay.pipeline.run_config import RunConfig
 from hrcreplay.pipeline.seen_bodies import SeenBodies
 from hrcreplay.pipeline.stored_volumes import StoredVolumes, select_stored_ticks, store_ticks, store_volumes
 from hrcreplay.pipeline.surroundings import Forecast, PredictionStage, Surroundings
-from hrcreplay.records import (
-    NOBODY,
-    CameraFrames,
-    Floats,
-    HumanStates,
-    Ints,
-    Measurements,
-    Motion,
-    SkeletonTrack,
-)
+from hrcreplay.records import NOBODY, CameraFrames, Floats, HumanStates, Ints, Measurements, Motion, SkeletonTrack
 from hrcreplay.robot.control.static_obstacles import StaticObstacles, nearest
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.store.columns import (

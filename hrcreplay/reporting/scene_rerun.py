@@ -17,14 +17,7 @@ from hrcreplay.geometry.distances import nearest_pair
 from hrcreplay.records import LENGTHS, POINTS, Floats
 from hrcreplay.reporting.figures.drawing import BONES
 from hrcreplay.reporting.metrics.series import thin_stretches
-from hrcreplay.reporting.replay_scene import (
-    MethodTrack,
-    ReplayScene,
-    at_rate,
-    placements,
-    pose_links,
-    shown_skeletons,
-)
+from hrcreplay.reporting.replay_scene import MethodTrack, ReplayScene, at_rate, placements, pose_links, shown_skeletons
 from hrcreplay.reporting.scene_messages import surface_mesh, upright_to, whole_surface
 from hrcreplay.reporting.tables import part_name_text
 from hrcreplay.store.stored_table import RunTable

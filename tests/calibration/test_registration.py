@@ -7,14 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hrcreplay.calibration import registration
-from hrcreplay.calibration.registration import (
-    Registration,
-    disagreement,
-    kabsch,
-    register,
-    rigid,
-    transform,
-)
+from hrcreplay.calibration.registration import Registration, disagreement, kabsch, register, rigid, transform
 from hrcreplay.records import MIRROR, POINTS, SkeletonTrack
 from tests.realdata import data_path
 from tests.reobserve import POSE, Truth, angle_deg, read_azure, reobserve, walker

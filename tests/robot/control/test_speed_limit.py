@@ -9,14 +9,7 @@ import pytest
 
 from hrcreplay.records import Floats
 from hrcreplay.robot.control.certificate import NO_PLANES, decide
-from hrcreplay.robot.control.control_step import (
-    BRAKING,
-    PlanSettings,
-    Proposal,
-    RobotState,
-    observe,
-    stop_straight,
-)
+from hrcreplay.robot.control.control_step import BRAKING, PlanSettings, Proposal, RobotState, observe, stop_straight
 from hrcreplay.robot.control.minimiser import Solution, minimise
 from hrcreplay.robot.control.qp_controller import QpContext, Target, problem, propose
 from hrcreplay.robot.control.separation import obstacles
