@@ -18,7 +18,7 @@ from hrcreplay.records import Bools, Floats, Ints
 from hrcreplay.robot.control.control_step import Taken, horizon_after
 from hrcreplay.robot.control.path_tick import decide_on_path
 from hrcreplay.robot.control.qp_tick import TickHulls, TickStart, decide_at_once
-from hrcreplay.robot.control.separation import NearestLink, boxes
+from hrcreplay.robot.control.separation import NearestLink, boxes, gap_of
 from hrcreplay.robot.kinematics import RobotPose
 from hrcreplay.robot.task import ReferencePoint, sample
 
@@ -186,15 +186,12 @@ def _write(
         horizon_s: Horizon of the volumes [s].
         dt_s: Length of a tick [s].
     """
-    start, point, surface_m = moving.start, moving.point, nearest.surface_m
+    start, point, gap = moving.start, moving.point, gap_of(nearest)
     found.q[tick], found.dq[tick] = start.stop.q[0], start.stop.dq[0]
     found.u[tick] = (taken.stop.dq[0] - start.stop.dq[0]) / dt_s
     found.ref_m[tick], found.ref_speed[tick] = point.T_world_tcp[:3, 3], norm_n(point.twist[:3])
     found.tcp_m[tick], found.tcp_speed[tick] = pose.T_world_tcp[:3, 3], norm_n(pose.twist_tcp[:3])
     found.programme_s[tick] = start.s_s
-    apart = not math.isnan(surface_m)
-    found.distance_m[tick] = (surface_m if surface_m > 0.0 else 0.0) if apart else np.nan
-    found.overlap_m[tick] = (-surface_m if surface_m < 0.0 else 0.0) if apart else np.nan
-    found.link[tick] = nearest.link if apart else -1
+    found.distance_m[tick], found.overlap_m[tick], found.link[tick] = gap.distance_m, gap.overlap_m, gap.link
     found.status[tick], found.reason[tick], found.certified[tick] = taken.status, taken.reason, taken.certified
     found.horizon_s[tick], found.tau_s[tick] = horizon_s, (len(start.stop.q) - 1) * dt_s

@@ -372,7 +372,8 @@ Proposals = list[Proposal] | int
 class Step(NamedTuple):
     """Decision of the controller in one tick."""
 
-    pose: RobotPose  #: at the tick
+    tcp_m: Floats  #: (3,) at the tick, world [m]
+    tcp_speed: float  #: at the tick [m/s]
     u: Floats  #: (nv,) applied from the tick on [rad/s^2]
     next: RobotState  #: one tick later, Eq. (68), (69)
     distance_m: float  #: surface to surface, smallest over all pairs; 0 in contact, NaN where not known [m]
@@ -541,8 +542,8 @@ def motion_row(
         dq=state.dq,
         u=step.u,
         ref_m=ref_m,
-        tcp_m=step.pose.T_world_tcp[:3, 3],
-        tcp_speed=step.pose.tcp_speed,
+        tcp_m=step.tcp_m,
+        tcp_speed=step.tcp_speed,
         ref_speed=ref_speed,
         programme_s=programme_s,
         distance_m=step.distance_m,
@@ -584,7 +585,8 @@ def make_step(sight: Sight, current_stop: Stop, taken: Taken, horizon_s: float, 
     """
     after = RobotState(taken.stop.q[0], taken.stop.dq[0])
     return Step(
-        pose=sight.pose,
+        tcp_m=sight.pose.T_world_tcp[:3, 3],
+        tcp_speed=sight.pose.tcp_speed,
         u=np.asarray((after.dq - current_stop.dq[0]) / dt_s),
         next=after,
         status=taken.status,

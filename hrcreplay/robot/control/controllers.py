@@ -26,16 +26,14 @@ from hrcreplay.robot.control.control_step import (
     Sight,
     Step,
     Stop,
-    Taken,
     at_rest,
     make_step,
     motion_row,
     observe,
-    sight_of,
     standstill_reason,
 )
 from hrcreplay.robot.control.qp_controller import QpContext
-from hrcreplay.robot.control.qp_tick import QpTick, TickHulls, TickStart, decide_held
+from hrcreplay.robot.control.qp_tick import BriefTick, TickHulls, TickStart, decide_held
 from hrcreplay.robot.control.separation import Obstacles
 from hrcreplay.robot.control.static_obstacles import StaticObstacles, shapes_of
 from hrcreplay.robot.model import RobotModel
@@ -109,28 +107,30 @@ class Controller(ABC):
         """One tick."""
         state, point, now_s = self.state, self.point, self.s_s
         with np.errstate(all="ignore"):  # invalid numbers lead to braking, not to warnings
-            seen, taken = self.decide(predict)
-        step = make_step(seen.sight, self.stop, taken, seen.horizon_s, self.settings.dt_s)
+            step = self.decide(predict)
         self.stop, self.u = step.stop, step.u
         self._move_on()
         return ControllerTick(state, point, now_s, step)
 
-    def decide(self, predict: Predict) -> tuple[Observation, Taken]:
-        """The people at the tick, and the motion that the robot executes."""
+    def decide(self, predict: Predict) -> Step:
+        """What the robot executes."""
         seen = self.observe(predict)
-        return seen, self._certify(seen, self.propose(seen))
+        return self._certify(seen, self.propose(seen))
 
-    def _certify(self, seen: Observation, proposals: Proposals) -> Taken:
-        """The first certified proposal, or the stop that continues."""
+    def _certify(self, seen: Observation, proposals: Proposals) -> Step:
+        """The step of the first certified proposal, or of the stop that continues."""
         seen_until = seen.obstacles, seen.horizon_s
         taken, self.planes = decide(
             self.robot, self.stop, proposals, *seen_until, self.planes, self.settings, self.static
         )
-        return taken
+        return make_step(seen.sight, self.stop, taken, seen.horizon_s, self.settings.dt_s)
 
     def observe(self, predict: Predict) -> Observation:
         """The people at the tick, with volumes that are valid until the end of the stop after the step."""
-        obstacles, horizon_s = self._volumes(predict)
+        return self._observe(*self._volumes(predict), predict)
+
+    def _observe(self, obstacles: Obstacles, horizon_s: float, predict: Predict) -> Observation:
+        """The people at the tick, with these volumes."""
         return Observation(
             observe(self.robot, self.state, obstacles, self.settings.plan.clearance_m), obstacles, horizon_s, predict
         )
@@ -153,20 +153,34 @@ class Controller(ABC):
 class QpController(Controller):
     """The trajectory generator of Section 5, along a reference that waits for the robot or runs with the clock."""
 
-    def decide(self, predict: Predict) -> tuple[Observation, Taken]:
-        """The people at the tick, and the motion that the robot executes; in one kernel, see ``qp_tick``."""
+    def decide(self, predict: Predict) -> Step:
+        """What the robot executes, by one kernel, see ``qp_tick``; what that leaves to Python is looked at again."""
         obstacles, horizon_s = self._volumes(predict)
         hulls = obstacles.vertices_m, obstacles.offsets, obstacles.radius_m, obstacles.boxes_m
         found = decide_held(self.scene, self.moment, TickHulls(*hulls, obstacles.known, horizon_s))
-        sight = sight_of(found.pose, found.finite, found.nearest, obstacles)
-        seen = Observation(sight, obstacles, horizon_s, predict)
         self.s_s, self.point = found.s_s, found.point
-        if found.decided:
-            self.planes = found.planes
-            return seen, found.taken
-        return seen, self._certify(seen, self._proposals(seen, found))
+        if not found.decided:
+            seen = self._observe(obstacles, horizon_s, predict)
+            return self._certify(seen, self._proposals(seen, found))
+        self.planes, taken, (distance_m, overlap_m, limb, link) = found.planes, found.taken, found.gap
+        return Step(
+            tcp_m=found.tcp_m,
+            tcp_speed=found.tcp_speed,
+            u=found.u,
+            next=RobotState(taken.stop.q[0], taken.stop.dq[0]),
+            distance_m=distance_m,
+            overlap_m=overlap_m,
+            limb=obstacles.among_all(limb) if limb >= 0 else limb,
+            link=link,
+            status=taken.status,
+            reason=taken.reason,
+            horizon_s=horizon_s,
+            tau_s=self.stop.ticks * self.settings.dt_s,
+            certified=taken.certified,
+            stop=taken.stop,
+        )
 
-    def _proposals(self, seen: Observation, found: QpTick) -> Proposals:
+    def _proposals(self, seen: Observation, found: BriefTick) -> Proposals:
         """The proposals of a tick that the kernel has not decided."""
         context = self._context(seen, found.rate, found.tcp_speed_max)
         again = qp_controller.propose if found.solved else qp_controller.try_again

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from hrcreplay.geometry.vectors import norm_n
 from hrcreplay.kernels import Held, njit
 from hrcreplay.records import Floats, Ints
 from hrcreplay.robot.control.control_step import (
@@ -26,7 +27,7 @@ from hrcreplay.robot.control.control_step import (
 )
 from hrcreplay.robot.control.motion_check import CLEAR, OPENING, RETREAT_SPEED, UNDECIDED, judge
 from hrcreplay.robot.control.qp_controller import Instant, Stops, Target, propose_stops, static_ahead_s
-from hrcreplay.robot.control.separation import NearestLink
+from hrcreplay.robot.control.separation import Gap, NearestLink, gap_of
 from hrcreplay.robot.control.static_obstacles import StaticShapes
 from hrcreplay.robot.kinematics import Arm, RobotPose
 from hrcreplay.robot.task import Grid, ReferencePoint, follow
@@ -103,8 +104,25 @@ def decide_at_once(
     return QpTick(pose, finite, nearest, reason, s_s, rate, point, cap, solved, decided, taken, planes)
 
 
+class BriefTick(NamedTuple):
+    """What Python needs of a tick: each array more would cost it half a microsecond."""
+
+    tcp_m: Floats  #: (3,) at the tick, world [m]
+    tcp_speed: float  #: [m/s]
+    gap: Gap  #: the limb by its place among the tick's volumes
+    s_s: float  #: as in ``QpTick``, like what follows
+    rate: float
+    point: ReferencePoint
+    tcp_speed_max: float
+    solved: bool
+    decided: bool
+    taken: Taken
+    u: Floats  #: (nv,) acceleration of the tick, if it is decided [rad/s^2]
+    planes: Floats
+
+
 @njit(cache=True)
-def decide_held(scene: Held, moment: TickStart, people: TickHulls) -> QpTick:
+def decide_held(scene: Held, moment: TickStart, people: TickHulls) -> BriefTick:
     """The same for calls from Python, which would convert the scene's arrays each time.
 
     Args:
@@ -113,7 +131,12 @@ def decide_held(scene: Held, moment: TickStart, people: TickHulls) -> QpTick:
         people: Their volumes.
     """
     arm, grid, rules, static = scene.value
-    return decide_at_once(arm, grid, rules, static, moment, people)
+    found = decide_at_once(arm, grid, rules, static, moment, people)
+    tcp_m, tcp_speed, taken = found.pose.T_world_tcp[:3, 3].copy(), norm_n(found.pose.twist_tcp[:3]), found.taken
+    u = (taken.stop.dq[0] - moment.stop.dq[0]) / rules.qp.dt_s
+    reference = found.s_s, found.rate, found.point, found.tcp_speed_max
+    gap, outcome = gap_of(found.nearest), (found.solved, found.decided)
+    return BriefTick(tcp_m, tcp_speed, gap, *reference, *outcome, taken, u, found.planes)
 
 
 @njit(cache=True, inner=True)

@@ -130,6 +130,24 @@ class NearestLink(NamedTuple):
     limb: int  #: -1 without a pair
 
 
+class Gap(NamedTuple):
+    """The nearest pair, as the record of a tick says it."""
+
+    distance_m: float  #: surface to surface; 0 in contact, NaN where not known [m]
+    overlap_m: float  #: depth of the link inside the volume, radii included; NaN where not known [m]
+    limb: int  #: -1 without a pair
+    link: int  #: -1 without a pair
+
+
+@njit(cache=True, inner=True)
+def gap_of(nearest: NearestLink) -> Gap:
+    """The nearest pair as it is recorded."""
+    if math.isnan(nearest.surface_m):
+        return Gap(np.nan, np.nan, -1, -1)
+    apart_m = nearest.surface_m
+    return Gap(apart_m if apart_m > 0.0 else 0.0, -apart_m if apart_m < 0.0 else 0.0, nearest.limb, nearest.link)
+
+
 @njit(cache=True)
 def measure(
     ends: Floats, link_radius: Floats, vertices: Floats, offsets: Ints, radius: Floats, clearance_m: float

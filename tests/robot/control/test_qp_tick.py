@@ -20,6 +20,7 @@ from hrcreplay.robot.control.control_step import (
     RETREATING,
     TRACKING,
     PlanSettings,
+    Step,
 )
 from hrcreplay.robot.control.controllers import Controller, QpController
 from hrcreplay.robot.control.qp_tick import decide_held
@@ -62,12 +63,11 @@ def assert_same(one: Any, other: Any) -> None:
         assert np.signbit(np.asarray(a, float)).tolist() == np.signbit(np.asarray(b, float)).tolist()
 
 
-def in_python(controller: QpController, seen: Obstacles) -> tuple[Any, Any, QpController]:
-    """The observation, the motion and the state after a tick that is taken step by step."""
+def in_python(controller: QpController, seen: Obstacles) -> tuple[Step, QpController]:
+    """The step, and the state after a tick that is taken part by part."""
     other = copy.copy(controller)
     with np.errstate(all="ignore"):
-        seen_there, taken = Controller.decide(other, lambda _: seen)
-    return seen_there[:3], taken, other
+        return Controller.decide(other, lambda _: seen), other
 
 
 def run(controller: QpController, people: list[Obstacles]) -> Counter[tuple[bool, int, int]]:
@@ -82,12 +82,11 @@ def run(controller: QpController, people: list[Obstacles]) -> Counter[tuple[bool
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("hrcreplay.robot.control.controllers.decide_held", listening)
         for seen in people:
-            seen_there, taken, after = in_python(controller, seen)
-            expected = (*pieces(seen_there), *pieces(taken))
+            expected, after = in_python(controller, seen)
             with np.errstate(all="ignore"):
                 own = copy.copy(controller)
-                seen_here, mine = own.decide(lambda _, seen=seen: seen)  # type: ignore[misc]
-            assert_same((*pieces(seen_here[:3]), *pieces(mine)), expected)
+                mine = own.decide(lambda _, seen=seen: seen)  # type: ignore[misc]
+            assert_same(mine, expected)
             assert_same((own.planes, own.s_s, own.point), (after.planes, after.s_s, after.point))
             controller.step(lambda _, seen=seen: seen)  # type: ignore[misc]
             counts[asked[-1].decided, mine.reason, mine.status] += 1
