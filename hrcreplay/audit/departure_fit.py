@@ -26,12 +26,16 @@ from hrcreplay.records import BODY, Bools, Floats
 
 #: Limbs that share a line: both sides of the body.
 _PAIRS = ((0,), (1,), (2, 4), (3, 5), (6,))
+_LEGS = BODY.index("LEGS")
 #: Share of a pair's departures below its line before the line is raised.
 _BELOW = 0.99
 #: Share of all rises and sinks of the pelvis below theirs.
 _RISEN = 0.995
-#: Maximum multiple of the residual; a larger one comes from the few logs with much noise.
-_STEEPEST = 1.0
+#: Maximum multiple of the residual of each pair; a larger one comes from the few logs with much noise. That of the legs
+#: is how far they are seen to go in a thirtieth of a second.
+_STEEPEST = (1.0, 1.0, 1.0, 1.0, 8.0)
+#: Acceleration with which legs at rest begin to move: their lines are at least as high as it takes them [m/s^2].
+_BEGINS_M_PER_S2 = 5.0
 #: Maximum slope over the speed: the time for which a limb's tube does not carry it, and for the filter's lag [s].
 _SWINGS_S = 0.3
 #: Maximum factor on a line, and that for logs with ground truth; a larger one comes from the few ticks at which a
@@ -59,21 +63,29 @@ def fit(samples: Sequence[LimbDepartures], share: float) -> Departure:
     rise_m, sink_m = (_rise(horizon_s, [s.height_m[way] for s in samples]) for way in range(2))
     plain = _lines(samples, horizon_s, rise_m, sink_m)
     factors = [_raise(samples, plain, k, share) for k in range(len(horizon_s))]
-    return _rounded(_times(plain, np.column_stack(factors)))
+    return _rounded(_begun(_times(plain, np.column_stack(factors))))
 
 
 def _lines(samples: Sequence[LimbDepartures], horizon_s: Floats, rise_m: Floats, sink_m: Floats) -> Departure:
     """Fits the lines, from the longest horizon down to the shortest, so that none is above that of a longer one."""
     now, goes, swings_s = np.zeros((3, len(BODY), len(horizon_s)))
-    for pair in map(list, _PAIRS):
+    for pair, steepest in zip(map(list, _PAIRS), _STEEPEST, strict=True):
         residual = [np.minimum(s.residual_m[:, pair], NOISE_M) for s in samples]
-        speed, most = [s.speed_m_per_s[:, pair] for s in samples], (np.inf, _STEEPEST, _SWINGS_S)
+        speed, most = [s.speed_m_per_s[:, pair] for s in samples], (np.inf, steepest, _SWINGS_S)
         for k in reversed(range(len(horizon_s))):
             beyond = [s.beyond_m(k, float(rise_m[k]), float(sink_m[k]))[:, pair] for s in samples]
             offset, times, slope = _line(beyond, [residual, speed], most).tolist()
             goes[pair, k], now[pair, k], swings_s[pair, k] = offset, times, slope
-            most = (offset, _STEEPEST, slope)
+            most = (offset, steepest, slope)
     return _rounded(Departure(horizon_s, goes, now, rise_m, sink_m, swings_s))
+
+
+def _begun(departure: Departure) -> Departure:
+    """Raises the legs' lines to those of legs that begin to move, but not above that of the longest horizon."""
+    beyond_m, last = departure.beyond_m.copy(), departure.beyond_m[_LEGS, -1]
+    begun_m = np.minimum(0.5 * _BEGINS_M_PER_S2 * departure.horizon_s**2, last)
+    beyond_m[_LEGS] = np.maximum(beyond_m[_LEGS], begun_m)
+    return replace(departure, beyond_m=beyond_m)
 
 
 def _rounded(departure: Departure) -> Departure:

@@ -103,7 +103,7 @@ def departures(stage: PredictionStage, recording: Recording, ticks: Ints) -> Lim
         volumes = tube_stage(stage, _bare(horizon_s, rise_m, sink_m), residual=False).volumes(states, horizon_s[k])
         found = check_containment(volumes, futures[k], body_radii_m(stage), nothing).beyond_m
         found = np.where(asked, found, np.nan)
-        found[~tubed.legs_shown, LEGS] = np.nan
+        found[:, LEGS] = np.where(tubed.legs_shown, np.maximum(0.0, found[:, LEGS] - tubed.legs_off_m), np.nan)
         return found
 
     heights = [_heights(bare.volumes(states, h), future) for h, future in zip(horizon_s, futures, strict=True)]

@@ -67,7 +67,8 @@ _STATE = (("p", ""), ("v", "_vel"), ("a", "_acc"), ("j", "_jerk"), ("p_std", "_s
 _RESIDUAL = tuple(f"residual_{limb}" for limb in BODY)
 _UNSEEN = tuple(f"unseen_{limb}" for limb in BODY)
 _FRAME_AGE = "frame_age_s"
-_NOBODY = ("nobody_s", "nobody_else_s")
+#: Columns that a table may lack: what is not known there.
+_MAYBE = ("legs_sway_m", "nobody_s", "nobody_else_s")
 _SHOWN = tuple(f"point_{point}_{axis}" for point in POINTS for axis in "xyz")
 
 
@@ -87,7 +88,7 @@ def state_columns(states: HumanStates) -> Columns:
         for i, camera in enumerate(states.cameras):
             columns |= _spread(states.camera_points_m[:, i].reshape(len(states), -1), _shown_by(camera))
     columns |= {_AS_LENGTH: states.p[:, _HEIGHT], f"{_AS_LENGTH}_std": states.p_std[:, _HEIGHT]}
-    columns |= {name: column for name in _NOBODY if (column := getattr(states, name)) is not None}
+    columns |= {name: column for name in _MAYBE if (column := getattr(states, name)) is not None}
     return columns | {f"valid_{camera}": states.valid[:, i] for i, camera in enumerate(states.cameras)}
 
 
@@ -185,6 +186,7 @@ def _states(column: Columns, cameras: tuple[str, ...]) -> HumanStates:
         points_m=_gather(column, _SHOWN).reshape(-1, len(POINTS), 3),
         cameras=cameras,
         camera_points_m=_camera_points(column, cameras),
+        legs_sway_m=column.get("legs_sway_m"),
         nobody_s=column.get("nobody_s"),
         nobody_else_s=column.get("nobody_else_s"),
         person=column.get("person"),

@@ -193,9 +193,12 @@ def test_no_line_is_steeper_than_the_steepest() -> None:
     """Beyond that it is the offset that grows, not what everybody pays by their cameras' noise."""
     residual = np.random.default_rng(3).uniform(0.01, 0.15, (400, len(BODY)))
     found = fit([given(np.stack([3.0 * residual] * 2), residual)], 0.99)
-    assert found.residuals.min() >= departure_fit._STEEPEST
-    assert found.residuals.max() < departure_fit._STEEPEST + 0.05
-    np.testing.assert_allclose(found.beyond_m + 0.15 * found.residuals, 0.45, atol=0.02)
+    upper, legs = slice(len(BODY) - 1), BODY.index("LEGS")
+    assert found.residuals[upper].min() >= 1.0
+    assert found.residuals[upper].max() < 1.05
+    np.testing.assert_allclose(found.beyond_m[upper] + 0.15 * found.residuals[upper], 0.45, atol=0.02)
+    np.testing.assert_allclose(found.residuals[legs], 3.0, atol=0.05)  # their sway, which is small
+    np.testing.assert_allclose(found.beyond_m[legs], 0.0, atol=0.01)
 
 
 def test_rise_and_sink_are_a_quantile_in_which_each_log_weighs_as_its_root() -> None:

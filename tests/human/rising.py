@@ -52,11 +52,11 @@ def body(t_s: Floats, duration_s: float, kind: str) -> Floats:
         points[:, POINTS.index(f"hip_{side}")] = hip
         points[:, POINTS.index(f"ankle_{side}")] = ankle
         points[:, POINTS.index(f"foot_{side}")] = ankle + 0.15 * ahead
-        points[:, POINTS.index(f"knee_{side}")] = _knee(hip, ankle, ahead)
+        points[:, POINTS.index(f"knee_{side}")] = knee(hip, ankle, ahead)
     return points
 
 
-def _knee(hip: Floats, ankle: Floats, ahead: Floats) -> Floats:
+def knee(hip: Floats, ankle: Floats, ahead: Floats) -> Floats:
     """Where thigh and shank meet, in front (n, 3) [m]."""
     thigh, shank = BONES_M
     line = ankle - hip

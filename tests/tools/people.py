@@ -14,7 +14,7 @@ from hrcreplay.audit import fit
 from hrcreplay.commands import inputs, replay
 from hrcreplay.logs.writer import LogWriter
 from hrcreplay.records import CameraFrames, Floats, Ints
-from tests.human import reaching, rising
+from tests.human import reaching, rising, stepping
 from tests.realdata import data_path
 from tests.test_recordings import IMPORTS, SARA, SARA_CELL
 
@@ -25,8 +25,8 @@ _CAMERA_HZ, _LATE_NS = 30.0, 20_000_000
 #: How often each does it in a log.
 _TIMES = 3
 #: Who begins to reach from rest within the horizon cannot be bounded without a ball of the arm's length around all:
-#: fast arms are not fitted, their coverage is measured.
-FAST = "simulated, fast arms"
+#: fast arms are not fitted, their coverage is measured. So is that of people who begin to walk.
+FAST, STEPS = "simulated, fast arms", "simulated, steps"
 #: Recordings of one tracker and person, by the beginnings of their names, and people simulated in one way.
 GROUPS = {
     "Azure Kinect, sevivi": ("azure walking", "azure squatting"),
@@ -37,6 +37,7 @@ GROUPS = {
     "simulated, demo": ("demo",),
     "simulated, rising": tuple(f"simulated, {kind}" for kind in KINDS),
     FAST: tuple(f"simulated, {kind}" for kind in reaching.KINDS),
+    STEPS: tuple(f"simulated, {kind}" for kind in stepping.KINDS),
 }
 
 
@@ -77,6 +78,11 @@ def reach(path: Path, kind: str) -> Path:
     return simulated(path, _TIMES * reaching.period_s(kind), lambda t_s: reaching.body(t_s, kind))
 
 
+def step(path: Path, kind: str) -> Path:
+    """A log of somebody who walks to another place and back, _TIMES."""
+    return simulated(path, _TIMES * stepping.period_s(kind), lambda t_s: stepping.body(t_s, kind))
+
+
 def fused(folder: Path) -> dict[str, Path]:
     """Name of a log -> a run of ``fuse`` on it, which holds its cell and settings."""
     runs = {replay.demo_log().name: replay.run("fuse", replay.demo_log(), out=folder / "demo")}
@@ -97,9 +103,10 @@ def fused(folder: Path) -> dict[str, Path]:
         for kind in KINDS:
             log = rise(folder / f"simulated, {kind}, {duration_s:g} s.mcap", duration_s, kind)
             runs[log.name] = replay.run("fuse", log, out=folder / f"{kind} {duration_s:g}")
-    for kind in reaching.KINDS:
-        log = reach(folder / f"simulated, {kind}.mcap", kind)
-        runs[log.name] = replay.run("fuse", log, out=folder / kind)
+    for kinds, made in ((reaching.KINDS, reach), (stepping.KINDS, step)):
+        for kind in kinds:
+            log = made(folder / f"simulated, {kind}.mcap", kind)
+            runs[log.name] = replay.run("fuse", log, out=folder / kind)
     return runs
 
 
@@ -117,7 +124,7 @@ def main() -> None:
         new = Path(folder) / out.name
         runs = fused(Path(folder))
         found = fit.run(
-            [*runs.values()], out=new, cover="limbs", groups=[group_of(log) for log in runs], checked=(FAST,)
+            [*runs.values()], out=new, cover="limbs", groups=[group_of(log) for log in runs], checked=(FAST, STEPS)
         )
         out.write_bytes(new.read_bytes())
     sys.stdout.write("".join(f"{line}\n" for line in found.lines))

@@ -27,6 +27,9 @@ _HAND_M = 0.3
 FOOT_M = (0.2, 0.0, -0.06)
 #: Distance below which two places of a point are the same but for the noise of a tracker [m].
 ALIKE_M = 0.05
+#: Least time in which a leg's point covers a way, so that a camera's rate matters little [ns], and the time over which
+#: the mean of the ways' squares is taken [s].
+_WAY_NS, _SWAY_S = 25_000_000, 0.5
 #: Maximum number of observations in the mean length of a leg's bone.
 _BONES_MOST = 600
 
@@ -153,11 +156,44 @@ def _learn_legs(
         if near[n]:
             from_below = points[k].copy()
             from_below[:2] -= pelvis[:2]
+            if not carried.disbelieved[k]:
+                _sway(residual, c, n, from_below, carried.capture_ns)
             _carry(carried, k, from_below)
     for side in range(2):
         if near[4 + side] and near[6 + side]:
             residual.foot[side] = _turned(points[_FEET[side]] - points[_ANKLES[side]], -heading)
     return found - near.sum()
+
+
+@njit(cache=True, inner=True)
+def _sway(model: ModelResidual, c: int, n: int, from_below: Floats, capture_ns: int) -> None:
+    """Adds the way of a leg's point since the camera showed it before.
+
+    Args:
+        model: Its ways are changed.
+        c: Index of the camera.
+        n: Index into LEG_POINTS.
+        from_below: (3,) the point, from below the pelvis [m].
+        capture_ns: Of the frame.
+    """
+    since = capture_ns - model.sway_ns[c, n]
+    if since < _WAY_NS:
+        return
+    if since <= SHOWN_NS:
+        share = 1.0 - np.exp(-since * 1e-9 / _SWAY_S)
+        model.sway[c, n] += share * (distance(from_below, model.sway_from[c, n]) ** 2 - model.sway[c, n])
+    model.sway_from[c, n], model.sway_ns[c, n] = from_below, capture_ns
+
+
+@njit(cache=True, inner=True)
+def legs_sway(model: ModelResidual, now: int) -> float:
+    """Root mean square of the recent ways of the legs' points that cameras show; NaN if none does [m]."""
+    total, count = 0.0, 0
+    for c in range(len(model.sway)):
+        for n in range(len(LEG_POINTS)):
+            if now - model.sway_ns[c, n] <= SHOWN_NS + _WAY_NS:
+                total, count = total + model.sway[c, n], count + 1
+    return np.sqrt(total / count) if count > 0 else np.nan
 
 
 @njit(cache=True, inner=True)

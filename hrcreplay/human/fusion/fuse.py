@@ -24,7 +24,7 @@ from hrcreplay.human.fusion.kalman import (
 from hrcreplay.human.fusion.kernel import run
 from hrcreplay.human.fusion.model_residual import BINS
 from hrcreplay.human.fusion.reported_deviations import FIRST_SPREAD
-from hrcreplay.human.model import LimitSet
+from hrcreplay.human.model import LEG_POINTS, LimitSet
 from hrcreplay.records import BODY, DOF, LENGTHS, LIMBS, POINTS, Bools, Floats, HumanStates, Ints, Measurements
 from hrcreplay.settings.sections import Fusion
 
@@ -121,6 +121,9 @@ def start(cameras: tuple[str, ...]) -> FusionState:
             leg_bones=np.zeros((c, 4)),
             leg_bones_seen=np.zeros((c, 4), dtype=np.int64),
             leg_bones_ns=np.full((c, 4), NEVER_NS),
+            sway=np.zeros((c, len(LEG_POINTS))),
+            sway_from=np.zeros((c, len(LEG_POINTS), 3)),
+            sway_ns=np.full((c, len(LEG_POINTS)), NEVER_NS),
             foot=np.tile(FOOT_M, (2, 1)),
         ),
     )
@@ -190,6 +193,7 @@ def fuse(
         points_m=track.points,
         cameras=measurements.cameras,
         camera_points_m=track.camera_points,
+        legs_sway_m=track.legs_sway,
     )
     trace = Trace(track.cov, track.damping, track.spread, track.autocorrelation)
     return after, states, _count_events(track, measurements.cameras), trace
@@ -281,6 +285,7 @@ def _track(n: int, cameras: int, *, traced: bool) -> Track:
         frame_age=np.full(n, np.inf),
         points=np.full((n, len(POINTS), 3), np.nan),
         camera_points=np.full((n, cameras, len(POINTS), 3), np.nan),
+        legs_sway=np.full(n, np.nan),
         cov=np.full((rows, DOF, 4, 4), np.nan),
         damping=np.ones((rows, DOF)),
         spread=np.full((rows, DOF), np.nan),

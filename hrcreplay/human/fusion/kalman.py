@@ -76,6 +76,9 @@ class ModelResidual(NamedTuple):
     leg_bones: Floats  #: (c, 4) mean length of the thighs, then shanks, right and left, that a camera shows [m]
     leg_bones_seen: Ints  #: (c, 4) number of observations in that mean
     leg_bones_ns: Ints  #: (c, 4) tick at which one last agreed with it
+    sway: Floats  #: (c, 8) mean square of the recent ways of LEG_POINTS beside the pelvis [m^2]
+    sway_from: Floats  #: (c, 8, 3) where the way under way began, from below the pelvis [m]
+    sway_ns: Ints  #: (c, 8) capture of that
     foot: Floats  #: (2, 3) last observed offset of the right and left foot from the ankle, in the body's heading [m]
 
 
@@ -142,6 +145,7 @@ class Track(NamedTuple):
     frame_age: Floats  #: (n,)
     points: Floats  #: (n, 20, 3)
     camera_points: Floats  #: (n, c, 20, 3)
+    legs_sway: Floats  #: (n,)
     cov: Floats  #: (n or 0, 13, 4, 4)
     damping: Floats  #: (n or 0, 13) of the derivatives, on the way to the tick
     spread: Floats  #: (n or 0, 13) of the filter

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hrcreplay.human.fusion.body_points import place
+from hrcreplay.human.fusion.body_points import legs_sway, place
 from hrcreplay.human.fusion.gating import validate_frame
 from hrcreplay.human.fusion.inverse_kinematics import ROWS
 from hrcreplay.human.fusion.kalman import (
@@ -206,6 +206,7 @@ def _leave(filter_: Filter, k: int, rules: Rules, track: Track, damping: Floats)
     write_residual(filter_.model, filter_.gate, now, rules, track.residual[k])
     write_unseen_times(now, filter_.estimate.row_ns, filter_.model.carried_ns, track.unseen[k])
     track.frame_age[k] = (now - filter_.gate.newest_ns[0]) * 1e-9
+    track.legs_sway[k] = legs_sway(filter_.model, now)
     place(filter_.estimate, filter_.model, track.points[k], track.camera_points[k])
     if len(track.cov) > 0:
         track.cov[k] = filter_.estimate.cov

@@ -259,6 +259,7 @@ def _by_points(one: Tracked, states: HumanStates) -> HumanStates:
         unseen_s=np.full_like(states.unseen_s, np.inf),
         frame_age_s=np.asarray((states.t_ns - one.shown_ns) * 1e-9),
         points_m=np.tile(np.asarray(one.shown_m), (len(states), 1, 1)),
+        legs_sway_m=np.full(len(states), np.nan),
     )
 
 

@@ -75,7 +75,7 @@ from hrcreplay.settings.sections import Prediction
 #: Added to every radius: more than the sum of all rounding errors [m].
 ROUNDING_M = 1e-9
 #: Added to the radius of legs out of sight: departures were fitted to legs that cameras show [m].
-HIDDEN_M = 0.06
+HIDDEN_M = 0.09
 #: Maximum number of points after a rotation or walking; above it the polytope around them is used.
 MOST_COPIED = 2000
 #: Number of points above which walking uses triangles of 60 degrees.
@@ -257,7 +257,8 @@ def _tube(i: int, limb: int, rows: SoundRows, span_s: float, rules: SoundRules, 
     tubed, thick = rows.tubed, rules.body_m[limb]
     reach_s = span_s + tubed.late_s[i, limb]
     points, shown, velocity = tubed.points[i], tubed.camera_points[i], rows.velocity[i]
-    count = tube(limb, points, shown, velocity, span_s, reach_s, rules.hand_m, rules.departure, swept)
+    new = tubed.legs_new[i]
+    count = tube(limb, points, shown, velocity, span_s, reach_s, rules.hand_m, new, rules.departure, swept)
     speed = rows.speed[i, limb]
     if limb == LEGS and not tubed.legs_shown[i]:
         speed = 0.0  # their radius was fitted to nobody who walks
@@ -267,6 +268,10 @@ def _tube(i: int, limb: int, rows: SoundRows, span_s: float, rules: SoundRules, 
         swept[0], count = np.nan, 1
     residual, lost = tubed.residual[i, limb], tubed.lost_m[i, limb]
     departs = departs_m(limb, reach_s, residual, speed, rules.departure)
+    if limb == LEGS:
+        thick += tubed.legs_off_m[i]
+        if not tubed.legs_shown[i]:  # below the pelvis, which may be elsewhere
+            departs = max(departs, tubed.residual[i, THORAX])
     if lost > 0.0:  # the filter brings an unseen torso to rest, but people walk on
         departs = max(departs, departs_m(limb, span_s, residual, speed, rules.departure) + lost)
     return count, thick + departs

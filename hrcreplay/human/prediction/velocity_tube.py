@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hrcreplay.human.model import ARM_POINTS, BENDS, HANDS, HEAD, LEG_POINTS, NECK, PELVIS, LimitSet, skeleton_row
+from hrcreplay.human.prediction.sound_reach import knees_out
 from hrcreplay.kernels import njit
 from hrcreplay.records import BODY, LIMBS, POINTS, Bools, Floats, HumanStates
 
@@ -33,6 +34,9 @@ _STRIDE = 2.0
 #: Age of the frame in which legs are mostly seen: since then they were carried with the pelvis, but one stood still and
 #: the other one swung [s].
 _LEGS_AGE_S = 0.07
+#: Sway of legs that counts at least; above which their departures grow no further: of people who walk, whose legs a
+#: tracker throws, or whose sway is not known; and of legs out of sight, as of somebody who works on one spot [m].
+_LEAST_SWAY_M, _MOST_SWAY_M, _HIDDEN_SWAY_M = 0.008, 0.03, 0.018
 #: Minimum distance of a hand from its wrist that gives a direction [m].
 _SHORT_M = 0.02
 HEAD_LIMB, THORAX, LEGS = (BODY.index(limb) for limb in ("HD", "THX", "LEGS"))
@@ -42,16 +46,13 @@ for _limb, _carrying in enumerate(((0, 1), (1,), (1, 2), (1, 2, 3), (1, 4), (1, 
     _CARRIED_BY[_limb, _carrying] = True
 #: Speed above which the bound on a limb's departure grows no further [m/s].
 FASTEST_M_PER_S = 1.0
-#: Minimum distance of the legs from where they are shown, while the residual of their person is unknown: in the first
-#: second trackers put legs that they do not see elsewhere, by as much as this [m].
-_LEGS_UNKNOWN_M = 0.55
 #: Speeds at which people walk and reach, ISO 13855; of each limb of BODY [m/s].
 WALKING_M_PER_S, HAND_M_PER_S = 1.6, 2.0
 PEOPLES_SPEEDS = np.array([HAND_M_PER_S if limb in LIMBS[2:] else WALKING_M_PER_S for limb in BODY])
 #: Standard deviations of the lengths that count while the residual is unknown.
 _LENGTHS_OFF = 2.0
 #: Maximum number of points of a tube for the fused limb, and for each camera.
-MOST_POINTS = 2 * (len(LEG_POINTS) + 2)
+MOST_POINTS = 2 * (len(LEG_POINTS) + 6)
 _ARMS = np.array(ARM_POINTS)
 #: Ends of each of BODY, repeated where there are fewer than three, and their number; of the legs the pelvis.
 _ENDS_OF = np.array(
@@ -70,10 +71,12 @@ class Tubes(NamedTuple):
 
     points: Floats  #: (n, 20, 3) of ``HumanStates.points_m``
     camera_points: Floats  #: (n, c, 20, 3) of ``HumanStates.camera_points_m``; c = 0 if they are not known
-    residual: Floats  #: (n, 7) residual of each limb of BODY, multiplied by ``residuals`` [m]
+    residual: Floats  #: (n, 7) what ``residuals`` multiplies: residual of each limb of BODY, sway of shown legs [m]
     usable: Bools  #: (n, 7) True: the limb has a tube
     legs_shown: Bools  #: (n,) True: the positions of both knees and ankles are known
     legs_m: Floats  #: (n,) their distance from the line below the pelvis [m]; NaN: unknown or not used
+    legs_new: Bools  #: (n,) True: the person is too new to believe where cameras show the legs
+    legs_off_m: Floats  #: (n,) how far they may be from where they are taken to be, of new people [m]
     late_s: Floats  #: (n, 7) time for which it may depart beyond horizon and latency, as it was seen that long ago [s]
     lost_m: Floats  #: (n, 7) how far people go in the time for which their torso has been out of sight [m]
 
@@ -119,12 +122,15 @@ def tubes(states: HumanStates, bounded: bool, unknown_m: float, memory_s: float)
         usable=np.zeros((n, len(BODY)), dtype=np.bool_),
         legs_shown=np.empty(n, dtype=np.bool_),
         legs_m=np.full(n, np.nan),
+        legs_new=np.zeros(n, dtype=np.bool_),
+        legs_off_m=np.zeros(n),
         late_s=np.empty((n, len(BODY))),
         lost_m=np.zeros((n, len(BODY))),
     )
     unseen_s, residual_m = np.ascontiguousarray(states.unseen_s), np.ascontiguousarray(states.residual_m)
     off_m = np.ascontiguousarray(_LENGTHS_OFF * states.lengths_std_m)
-    _tube_rows(unseen_s, residual_m, off_m, bounded, unknown_m, memory_s, found)
+    sway_m = np.full(n, np.nan) if states.legs_sway_m is None else np.ascontiguousarray(states.legs_sway_m)
+    _tube_rows(unseen_s, residual_m, off_m, sway_m, bounded, unknown_m, memory_s, found)
     return found
 
 
@@ -133,6 +139,7 @@ def _tube_rows(
     unseen_s: Floats,
     residual_m: Floats,
     off_m: Floats,
+    sway_m: Floats,
     bounded: bool,
     unknown_m: float,
     memory_s: float,
@@ -152,15 +159,20 @@ def _tube_rows(
             if limb == LEGS and found.legs_shown[i]:
                 unseen = np.maximum(unseen, unseen_s[i, LEGS])
             found.late_s[i, limb] = np.minimum(np.maximum(unseen - _FRESH_S, 0.0), memory_s)
-            if not np.isnan(unknown_m):
-                # the residual of the legs is not related to departures
-                of = THORAX if limb == LEGS else limb
-                own = residual_m[i, of]
-                if np.isnan(own):
-                    own = max(unknown_m, _LEGS_UNKNOWN_M) if limb == LEGS else unknown_m + displaced[of]
-                found.residual[i, limb] = own
+            if limb < LEGS and not np.isnan(unknown_m):
+                own = residual_m[i, limb]
+                found.residual[i, limb] = max(unknown_m, displaced[limb]) if np.isnan(own) else own
+        found.legs_new[i] = bounded and np.isnan(residual_m[i, THORAX])
         if not np.isnan(unknown_m):
             found.legs_m[i] = residual_m[i, LEGS]
+            found.legs_off_m[i] = unknown_m if found.legs_new[i] else 0.0
+            found.residual[i, LEGS] = _sway_of(sway_m[i]) if found.legs_shown[i] else _HIDDEN_SWAY_M
+
+
+@njit(cache=True, inner=True)
+def _sway_of(shown_m: float) -> float:
+    """Sway of legs that cameras show as far as it counts [m]."""
+    return max(_LEAST_SWAY_M, min(shown_m, _MOST_SWAY_M)) if np.isfinite(shown_m) else _MOST_SWAY_M
 
 
 @njit(cache=True, inner=True)
@@ -273,6 +285,7 @@ def tube(
     span_s: float,
     reach_s: float,
     hand_m: float,
+    legs_new: bool,
     table: DepartureTable,
     swept: Floats,
 ) -> int:
@@ -288,13 +301,14 @@ def tube(
         span_s: Horizon and latency [s].
         reach_s: Time after the tick until which the limb may depart [s].
         hand_m: Length of the hand beyond the wrist [m].
+        legs_new: Whether the legs may be elsewhere than they are shown.
         table: The bounds.
         swept: ((1 + c) MOST_POINTS, 3) receives the points.
     """
     carries_s = _CARRIES_S if limb in (HEAD_LIMB, THORAX, LEGS) else _CARRIES_ARMS_S
     unmeasured_s = max(0.0, span_s - table.horizon_s[-1])  # for these points only the velocity is known
     carries_s = min(span_s, carries_s + unmeasured_s)
-    n = _ends(limb, points, shown, velocity, carries_s, hand_m, swept)
+    n = _ends(limb, points, shown, velocity, carries_s, hand_m, legs_new, swept)
     rising = n
     if limb == LEGS:
         rising = 2
@@ -311,11 +325,18 @@ def tube(
 
 @njit(cache=True, inner=True)
 def _ends(
-    limb: int, points: Floats, shown: Floats, velocity: Floats, span_s: float, hand_m: float, swept: Floats
+    limb: int,
+    points: Floats,
+    shown: Floats,
+    velocity: Floats,
+    span_s: float,
+    hand_m: float,
+    legs_new: bool,
+    swept: Floats,
 ) -> int:
     """Writes a limb's ends at the tick and after ``span_s``; returns the number of points; the pelvis's come first."""
     if limb == LEGS:
-        return _legs(points, shown, velocity, span_s, swept)
+        return _legs(points, shown, velocity, span_s, legs_new, swept)
     if limb not in (HEAD_LIMB, THORAX) and (limb - 2) % 2 == 1:
         return _lower_arm(limb, points, shown, velocity, span_s, hand_m, swept)
     n = 0
@@ -330,7 +351,11 @@ def _ends(
 
 
 @njit(cache=True, inner=True)
-def _legs(points: Floats, shown: Floats, velocity: Floats, span_s: float, swept: Floats) -> int:
+def _legs(points: Floats, shown: Floats, velocity: Floats, span_s: float, new: bool, swept: Floats) -> int:
+    """Writes the legs; of somebody new also from the line below the pelvis to stretched ahead, as far as that allows.
+
+    In the first second a tracker puts legs that it does not see below the pelvis, and finds them ahead of who sits.
+    """
     n = _add(points[PELVIS], velocity[PELVIS], span_s, swept, 0)
     for c in range(len(shown)):
         if np.isfinite(shown[c, PELVIS, 0]):
@@ -345,11 +370,23 @@ def _legs(points: Floats, shown: Floats, velocity: Floats, span_s: float, swept:
         for c in range(len(shown)):
             if np.isfinite(shown[c, k, 0]):
                 n = _add(shown[c, k] - stood, along, span_s + _LEGS_AGE_S / _STRIDE, swept, n)
-    if not np.isfinite(points[BENDS].sum()):  # around the line from the floor to the pelvis
-        below = points[PELVIS].copy()
-        below[2] = 0.0
+    below = points[PELVIS].copy()
+    below[2] = 0.0
+    if new or not np.isfinite(points[BENDS].sum()):  # around the line from the floor to the pelvis
         n = _add(below, along, span_s, swept, n)
+    if new:
+        ahead = 2.0 * knees_out(points[PELVIS, 2]) * _heading(points)
+        n = _add(below + ahead, along, span_s, swept, n)
+        n = _add(points[PELVIS] + ahead, along, span_s, swept, n)
     return n
+
+
+@njit(cache=True, inner=True)
+def _heading(points: Floats) -> Floats:
+    """(3,) horizontal direction in which a body's shoulders face; 0 if they are one above the other."""
+    across = points[ARM_POINTS[1][0]] - points[ARM_POINTS[0][0]]  # to the left
+    size = np.sqrt(across[0] ** 2 + across[1] ** 2)
+    return np.array([across[1], -across[0], 0.0]) / size if size > 0.0 else np.zeros(3)
 
 
 @njit(cache=True, inner=True)

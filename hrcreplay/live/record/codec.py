@@ -117,7 +117,7 @@ class Perception:
 
 
 #: Version of the messages, kept in the start event; records of another one cannot be decoded.
-FORMAT = 4
+FORMAT = 5
 
 ROBOT, REPLY, SKELETON, PERCEPTION, VOLUMES, DECISION, TIMEOUT, EVENT = (b"R", b"C", b"F", b"L", b"V", b"A", b"S", b"E")
 

@@ -135,7 +135,7 @@ def _states(looks: list[codec.RecordedPerception], cameras: tuple[str, ...], whe
     widths = dict.fromkeys(("p", "v", "a", "j", "p_std", "v_std"), DOF)
     widths |= dict.fromkeys(("lengths_m", "lengths_std_m"), len(LENGTHS))
     widths |= {"residual_m": len(BODY), "unseen_s": len(BODY), "frame_age_s": 1, "points_m": 3 * len(POINTS)}
-    widths["camera_points_m"] = 3 * len(POINTS) * len(cameras)
+    widths |= {"camera_points_m": 3 * len(POINTS) * len(cameras), "legs_sway_m": 1}
     watched = ("nobody_s", "nobody_else_s") if numbers.shape[1] == sum(widths.values()) + 2 else ()
     widths |= dict.fromkeys(watched, 1)
     ends = np.cumsum(list(widths.values()))
@@ -145,7 +145,7 @@ def _states(looks: list[codec.RecordedPerception], cameras: tuple[str, ...], whe
             "would be right: the version of hrcreplay that recorded the session"
         )
     parts = dict(zip(widths, np.split(numbers, ends[:-1], axis=1), strict=True))
-    for name in ("frame_age_s", *watched):
+    for name in ("frame_age_s", "legs_sway_m", *watched):
         parts[name] = parts[name][:, 0]
     parts["points_m"] = parts["points_m"].reshape(len(numbers), len(POINTS), 3)
     parts["camera_points_m"] = parts["camera_points_m"].reshape(len(numbers), len(cameras), len(POINTS), 3)

@@ -191,6 +191,6 @@ def test_a_record_of_another_version_is_left_as_it_is(tmp_path: Path, messages: 
     other = replace(perception.states, residual_m=perception.states.residual_m[:, 1:])
     partial = folder.make_partial(tmp_path / "session")
     made.record(partial / "log.mcap", [messages[0], codec.encode_perception(replace(perception, states=other), 0)])
-    with pytest.raises(LogError, match=facts("session.partial", "286", "287")):
+    with pytest.raises(LogError, match=facts("session.partial", "287", "288")):
         folder.finish(partial)
     assert (partial / "log.mcap").exists()
