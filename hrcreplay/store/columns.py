@@ -106,6 +106,7 @@ COLUMNS = {
         *_UNSEEN,
         _FRAME_AGE,
         *_SHOWN,
+        "legs_sway_m",
     ),
     "occupancy": ("t_ns", "limb", "method", "radius_m", "volume_m3", "vertices", "horizon_s"),
     "motion": (
