@@ -31,10 +31,11 @@ _LEGS = BODY.index("LEGS")
 _BELOW = 0.99
 #: Share of all rises and sinks of the pelvis below theirs.
 _RISEN = 0.995
-#: Maximum multiple of the residual of each pair; a larger one comes from the few logs with much noise. That of the legs
-#: is how far they are seen to go in a thirtieth of a second.
+#: Maximum multiple of the residual of each pair; a larger one comes from the few logs with much noise. The residual of
+#: legs is their sway, a motion, of which a departure is several times as large.
 _STEEPEST = (1.0, 1.0, 1.0, 1.0, 8.0)
-#: Acceleration with which legs at rest begin to move: their lines are at least as high as it takes them [m/s^2].
+#: Acceleration with which legs at rest begin to move: their lines are at least as high as it takes them. Large enough
+#: for simulated people who get up in 0.6 s (``tests/human/rising.py``) [m/s^2].
 _BEGINS_M_PER_S2 = 5.0
 #: Maximum slope over the speed: the time for which a limb's tube does not carry it, and for the filter's lag [s].
 _SWINGS_S = 0.3

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import partial
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -9,9 +12,11 @@ from hrcreplay.geometry.inflated_hull import InflatedHull
 from hrcreplay.human.model import skeleton
 from hrcreplay.human.prediction.swept_volumes import Predictor
 from hrcreplay.limits import load_limits
+from hrcreplay.pipeline.run_config import RunOptions
 from hrcreplay.records import BODY, POINTS, Floats, HumanStates
 from hrcreplay.settings.sections import Prediction
 from tests.human.people import LENGTHS_M, states
+from tests.tools import oracle
 from tests.tools.oracle import MARGIN_S, Oracle, Recorded
 
 RATE_HZ, HORIZON_S = 100.0, 0.2
@@ -33,6 +38,16 @@ def walking() -> tuple[HumanStates, Floats]:
 def foreseen(of: HumanStates, points: Floats) -> Oracle:
     recorded = Recorded.of(of.t_ns, points, SETTINGS.hand_m)
     return Oracle(Predictor(load_limits("people"), SETTINGS, 0.5), {1: recorded}, RADII_M)
+
+
+def test_a_robot_that_knows_the_future_is_ahead_of_one_that_predicts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The tool itself, on 2.5 s of the demo with its worker beside the robot."""
+    monkeypatch.setattr(oracle, "RunOptions", partial(RunOptions, start_s=6.0, end_s=8.5))
+    found = oracle.measure("demo", 2.0, tmp_path)
+    assert found["near_ticks"] > 100
+    assert found["oracle_pace"] > found["qp_pace"] + 0.05
 
 
 @pytest.mark.parametrize("tick", [10, 40])
@@ -61,9 +76,9 @@ def test_whoever_does_what_was_recorded_stays_inside_and_what_comes_later_does_n
 def test_a_limb_that_was_not_recorded_keeps_its_predicted_volume() -> None:
     of, points = walking()
     points[:, POINTS.index("wrist_l")] = np.nan
-    oracle = foreseen(of, points)
-    found = oracle.prepare(of).volumes(HORIZON_S, 20, 22)
-    plain = oracle.plain.prepare(of).volumes(HORIZON_S, 20, 22)
+    future = foreseen(of, points)
+    found = future.prepare(of).volumes(HORIZON_S, 20, 22)
+    plain = future.plain.prepare(of).volumes(HORIZON_S, 20, 22)
     for row in range(2):
         for k, limb in enumerate(BODY):
             same = np.array_equal(found.vertices(row, k), plain.vertices(row, k))

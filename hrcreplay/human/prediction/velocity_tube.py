@@ -34,8 +34,8 @@ _STRIDE = 2.0
 #: Age of the frame in which legs are mostly seen: since then they were carried with the pelvis, but one stood still and
 #: the other one swung [s].
 _LEGS_AGE_S = 0.07
-#: Sway of legs that counts at least; above which their departures grow no further: of people who walk, whose legs a
-#: tracker throws, or whose sway is not known; and of legs out of sight, as of somebody who works on one spot [m].
+#: Sway of legs, ``HumanStates.legs_sway_m``, that counts at least; that counts at most, as of people who walk, whose
+#: legs a tracker throws, or whose sway is not known; and of legs out of sight, as of somebody on one spot [m].
 _LEAST_SWAY_M, _MOST_SWAY_M, _HIDDEN_SWAY_M = 0.008, 0.03, 0.018
 #: Minimum distance of a hand from its wrist that gives a direction [m].
 _SHORT_M = 0.02
@@ -71,12 +71,12 @@ class Tubes(NamedTuple):
 
     points: Floats  #: (n, 20, 3) of ``HumanStates.points_m``
     camera_points: Floats  #: (n, c, 20, 3) of ``HumanStates.camera_points_m``; c = 0 if they are not known
-    residual: Floats  #: (n, 7) what ``residuals`` multiplies: residual of each limb of BODY, sway of shown legs [m]
+    residual: Floats  #: (n, 7) what ``residuals`` multiplies: residual of each limb of BODY, of LEGS their sway [m]
     usable: Bools  #: (n, 7) True: the limb has a tube
     legs_shown: Bools  #: (n,) True: the positions of both knees and ankles are known
     legs_m: Floats  #: (n,) their distance from the line below the pelvis [m]; NaN: unknown or not used
     legs_new: Bools  #: (n,) True: the person is too new to believe where cameras show the legs
-    legs_off_m: Floats  #: (n,) how far they may be from where they are taken to be, of new people [m]
+    legs_off_m: Floats  #: (n,) how far the legs of new people may be from their hull; 0 for others [m]
     late_s: Floats  #: (n, 7) time for which it may depart beyond horizon and latency, as it was seen that long ago [s]
     lost_m: Floats  #: (n, 7) how far people go in the time for which their torso has been out of sight [m]
 
@@ -163,10 +163,10 @@ def _tube_rows(
                 own = residual_m[i, limb]
                 found.residual[i, limb] = max(unknown_m, displaced[limb]) if np.isnan(own) else own
         found.legs_new[i] = bounded and np.isnan(residual_m[i, THORAX])
+        found.residual[i, LEGS] = _sway_of(sway_m[i]) if found.legs_shown[i] else _HIDDEN_SWAY_M
         if not np.isnan(unknown_m):
             found.legs_m[i] = residual_m[i, LEGS]
             found.legs_off_m[i] = unknown_m if found.legs_new[i] else 0.0
-            found.residual[i, LEGS] = _sway_of(sway_m[i]) if found.legs_shown[i] else _HIDDEN_SWAY_M
 
 
 @njit(cache=True, inner=True)

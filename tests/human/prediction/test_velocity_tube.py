@@ -184,6 +184,17 @@ def test_until_the_residual_is_known_the_errors_of_the_lengths_up_to_a_limb_coun
         assert legs_m == pytest.approx(FLESH_M["LEGS"] + unknown_m + residual_of(states, tick, "LEGS"), abs=2e-9)
 
 
+def test_legs_go_as_far_without_distances_from_the_model() -> None:
+    """Their sway is a motion, no distance from the model: ``prediction.residual = false`` does not leave it out."""
+    states, k = people(4, seed=13), BODY.index("LEGS")
+    with_them, without_them = (
+        predict(states, PEOPLE, Prediction(residual=residual), horizon_s=0.1, memory_s=MEMORY_S)
+        for residual in (True, False)
+    )
+    np.testing.assert_array_equal(with_them.radius_m[:, k], without_them.radius_m[:, k])
+    assert (with_them.radius_m[:, :k] > without_them.radius_m[:, :k]).all()
+
+
 @pytest.mark.parametrize("pelvis_m", [0.94, 0.6])
 def test_legs_of_somebody_new_may_be_anywhere_from_below_to_stretched_ahead(pelvis_m: float) -> None:
     """A tracker puts legs that it does not see below the pelvis; then it finds them ahead of somebody who sits."""
