@@ -184,6 +184,15 @@ def test_until_the_residual_is_known_the_errors_of_the_lengths_up_to_a_limb_coun
         assert legs_m == pytest.approx(FLESH_M["LEGS"] + unknown_m + residual_of(states, tick, "LEGS"), abs=2e-9)
 
 
+def test_legs_whose_sway_nobody_knows_go_as_far_as_those_of_who_walks() -> None:
+    states, k = people(4, seed=13), BODY.index("LEGS")
+    swaying = (np.full(len(states), 0.5), np.full(len(states), np.nan), None)
+    of = [replace(states, legs_sway_m=sway) for sway in swaying]
+    most, *unknown = (predict(s, PEOPLE, Prediction(), horizon_s=0.1, memory_s=MEMORY_S).radius_m[:, k] for s in of)
+    for radius_m in unknown:
+        np.testing.assert_array_equal(radius_m, most)
+
+
 def test_legs_go_as_far_without_distances_from_the_model() -> None:
     """Their sway is a motion, no distance from the model: ``prediction.residual = false`` does not leave it out."""
     states, k = people(4, seed=13), BODY.index("LEGS")
