@@ -209,6 +209,7 @@ def test_legs_of_somebody_new_may_be_anywhere_from_below_to_stretched_ahead(pelv
     """A tracker puts legs that it does not see below the pelvis; then it finds them ahead of somebody who sits."""
     states = people(6, seed=5)
     points = states.points_m + [0.0, 0.0, 1.0] * (pelvis_m - states.points_m[:, :1])
+    points[:, [POINTS.index(name) for name in LEGS]] = points[:, :1]  # they say nothing of where the legs are
     states = replace(states, v=np.zeros_like(states.v), points_m=points, camera_points_m=None)
     new = replace(states, residual_m=np.full_like(states.residual_m, np.nan))
     known, unknown = (predict(of, PEOPLE, Prediction(), horizon_s=0.1, memory_s=MEMORY_S) for of in (states, new))
