@@ -71,6 +71,17 @@ def test_two_cameras_that_agree_outvote_a_third_one_after_a_while(names: tuple[s
     assert all(0.6 * shown < counts[name] < shown for name in told)
 
 
+def test_legs_that_only_a_disbelieved_camera_throws_do_not_sway() -> None:
+    seen = standing(THREE)
+    thrown = moved(seen, LEG, ASIDE_M, seen.camera == 2)
+    thrown = moved(thrown, LEG, (0.2, 0.0, 0.0), (seen.camera == 2) & (np.arange(len(seen)) // 3 % 2 == 0))
+    (states, _), (plain, _) = fused(thrown), fused(seen)
+    assert states.legs_sway_m is not None
+    assert plain.legs_sway_m is not None
+    assert states.legs_sway_m[250] > 0.05
+    assert states.legs_sway_m[-1] == pytest.approx(plain.legs_sway_m[-1], abs=0.003)
+
+
 def test_the_first_camera_is_outvoted_even_though_the_filter_began_with_it() -> None:
     """Before, its arm kept the two others out for ever, and they made the arm's volume thick."""
     seen = standing(THREE)
