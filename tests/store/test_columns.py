@@ -11,6 +11,25 @@ from hrcreplay.store.columns import read_states, read_states_at, state_columns
 from hrcreplay.store.run_folder import FolderTables, TableWriter
 from tests.human.people import states
 
+#: Fields of the states that are integers, booleans or names.
+NOT_NUMBERS = ("t_ns", "valid", "cameras", "person")
+
+
+def test_every_field_of_the_states_is_read_as_it_was_written(tmp_path: Path) -> None:
+    rng = np.random.default_rng(9)
+    plain = states(rng.normal(size=(30, DOF)), rng.normal(size=(30, DOF)))
+    plain = replace(plain, legs_sway_m=plain.frame_age_s, camera_points_m=plain.points_m[:, None])
+    plain = replace(plain, nobody_s=plain.frame_age_s, nobody_else_s=plain.frame_age_s, person=1 + np.arange(30))
+    numbers = {name: rng.normal(size=np.shape(part)) for name, part in vars(plain).items() if name not in NOT_NUMBERS}
+    written = replace(plain, **numbers)
+    tables = FolderTables(tmp_path)
+    tables.table("state", state_columns(written))
+    tables.close_tables()
+    found = HumanStates.join(list(read_states(tmp_path / "state.parquet", 1000)))
+    for name, value in vars(written).items():
+        assert value is not None, name
+        np.testing.assert_array_equal(getattr(found, name), value, err_msg=name)
+
 
 @pytest.mark.parametrize("people", [1, 2])
 def test_the_states_of_some_ticks_are_read_from_any_group_of_rows(
