@@ -321,8 +321,8 @@ class HumanStates(Table):
     #: (n, c, 20, 3) recent POINTS as each camera shows them, world [m]; while the torso is seen only those away from
     #: ``points_m``, otherwise NaN. None: not known
     camera_points_m: Floats | None = None
-    #: (n,) sway: root mean square of the recent ways of the legs' points beside the pelvis, in 25 ms or a frame of the
-    #: camera if that is longer [m]; NaN while no camera shows them. None: not known
+    #: (n,) sway: root mean square of the recent ways of the legs' points beside the pelvis, from one frame of a
+    #: camera to the next that is at least 25 ms later [m]; NaN while no camera shows them. None: not known
     legs_sway_m: Floats | None = None
     nobody_s: Floats | None = None  #: (n,) time since the watched area was last empty [s]; None: no watched area
     nobody_else_s: Floats | None = None  #: (n,) the same, apart from the people tracked [s]; inf before the first time

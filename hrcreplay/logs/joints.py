@@ -6,7 +6,6 @@ irregularity gives a note.
 
 from __future__ import annotations
 
-import re
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -16,7 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hrcreplay.errors import LogError, SettingsError
+from hrcreplay.errors import LogError
+from hrcreplay.logs.joint_names import NAMELESS, list_names, match_names
 from hrcreplay.logs.log_files import LogFiles
 from hrcreplay.logs.messages import Message, Undecodable, stamp_ns, topic_list
 from hrcreplay.records import AxisFrame, Bools, Floats, Ints, Table
@@ -43,8 +43,6 @@ _CONSTANT_S = 0.05
 _AGREE_RAD = 0.05
 #: Maximum motion of a resting joint that is not an axis of the robot [rad or m].
 _AT_REST = 1e-3
-#: Prefix of the name of an unnamed joint, before its index in the message.
-_NAMELESS = "#"
 
 
 @dataclass(frozen=True)
@@ -134,7 +132,7 @@ def _read_topic(source: LogFiles, name: str, defects: Counter[str]) -> JointTopi
             continue
         if not len(positions):
             continue  # velocities or efforts alone
-        names = names or [f"{_NAMELESS}{i}" for i in range(1, len(positions) + 1)]
+        names = names or [f"{NAMELESS}{i}" for i in range(1, len(positions) + 1)]
         if len(names) != len(positions) or len(set(names)) != len(names):
             defects["joints_malformed"] += 1
             continue
@@ -261,7 +259,8 @@ def read_track(
         LogError: The joints do not fit the robot, two topics contradict each other, or an axis has no position.
         SettingsError: ``logs.joint_names`` does not fit robot or log.
     """
-    names = match_names(topics, axes, options.joint_names, where)
+    found = list(dict.fromkeys(name for topic in topics for name in topic.joints))
+    names = match_names(found, axes, options.joint_names, f"{where}: {', '.join(topic.name for topic in topics)}")
     chosen = _choose(topics, names)
     clocks: dict[str, Clock] = {}
     instants: dict[str, Ints] = {}
@@ -281,140 +280,13 @@ def read_track(
     defects["joint_gaps_ms"] += round(_covered_ns(track.gaps_ns) / 1e6)
     read = dict.fromkeys(topic.name for topic in chosen.values())
     notes = [
-        *_match_names(topics, names, chosen),
+        *_name_remarks(topics, names, chosen),
         *agreed,
         *(clocks[name].remark for name in read if clocks[name].remark),
         *_small_degrees(track, options.joints_unit),
     ]
     sources = {axis: (chosen[axis].name, names[axis]) for axis in axes}
     return JointReading(track, sources, tuple(clocks[name] for name in read), tuple(notes))
-
-
-def match_names(topics: Sequence[JointTopic], axes: Sequence[str], given: Sequence[str], where: str) -> dict[str, str]:
-    """Matches axes to joints in the log by name: axis -> joint.
-
-    A joint is the axis of the same name, ignoring case and characters other than letters and digits: joint1 is joint_1.
-    Where the robot's axes have the names of a maker, other names that the maker's drivers give to the same axes count.
-    The order in a message is used only if it has no names and as many positions as the robot has axes. A log that
-    numbers its joints from 0, or beyond the axes of the robot, counts as that of another robot until names are given.
-
-    Args:
-        topics: Result of ``read_topics``.
-        axes: The robot's joints, from the base on.
-        given: The log's names in that order; () if they equal the robot's.
-        where: Start of error messages: the log.
-
-    Raises:
-        LogError: The names do not fit.
-        SettingsError: The given names do not fit.
-    """
-    found = dict.fromkeys(name for topic in topics for name in topic.joints)
-    if given:
-        return _check_names(list(found), axes, given)
-    plain: dict[str, list[str]] = {}
-    for name in found:
-        plain.setdefault(_plain(name), []).append(name)
-    names = {}
-    for axis in axes:
-        alike = plain.get(_plain(axis), [])
-        if axis in found or len(alike) == 1:
-            names[axis] = axis if axis in found else alike[0]
-    more = _beyond(list(found), axes)
-    if len(set(names.values())) == len(axes) and not more:
-        return names
-    nameless = [name for name in found if name.startswith(_NAMELESS)]
-    if not names and len(nameless) == len(axes):
-        return dict(zip(axes, nameless, strict=True))
-    if made := _match_by_make(list(found), axes):
-        return made
-    raise _unfit(topics, axes, more, where)
-
-
-#: Names that drivers and recorders of a maker give to its axes, each with what numbers the axis; a prefix may precede.
-_UR = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
-_MAKES = (
-    (re.compile(r"(?:.*[_/.])?(?:panda|fr3|fer)_joint_?([1-7])"), "1234567"),
-    (re.compile(rf"(?:.*[_/.])?({'|'.join(_UR)})(?:_joint)?"), _UR),
-    (re.compile(r"(?:.*[_/.])?actual_q_?([0-5])"), "012345"),
-    (re.compile(r"(?:.*[_/.])?a([1-7])"), "1234567"),
-)
-#: Makes of ``_MAKES`` that name the axes of the robot -> makes that may name them in a log.
-_SAME_MAKE = {0: (0,), 1: (1, 2), 3: (3,)}
-
-
-def _match_by_make(found: Sequence[str], axes: Sequence[str]) -> dict[str, str]:
-    """Matches the axes of a Franka, Universal Robots or KUKA arm to joints named by its maker; empty if not certain.
-
-    Every axis must have a name of one maker, and every such name must be in the log exactly once: a log of two arms, or
-    of one with other axes, is not matched.
-    """
-    for make, others in _SAME_MAKE.items():
-        mine = _places(axes, make)
-        if sorted(mine.values()) != list(range(len(axes))):
-            continue
-        for other in others:
-            theirs = _places(found, other)
-            if sorted(theirs.values()) == list(range(len(axes))):
-                joints = {place: name for name, place in theirs.items()}
-                return {axis: joints[place] for axis, place in mine.items()}
-    return {}
-
-
-def _places(names: Sequence[str], make: int) -> dict[str, int]:
-    """Returns name -> number of the axis, from 0 at the base, of the names of a make."""
-    pattern, order = _MAKES[make]
-    matches = {name: pattern.fullmatch(name.casefold()) for name in names}
-    return {name: order.index(match[1]) for name, match in matches.items() if match}
-
-
-def _check_names(found: Sequence[str], axes: Sequence[str], given: Sequence[str]) -> dict[str, str]:
-    setting = "logs.joint_names"
-    if len(given) != len(axes):
-        raise SettingsError(
-            f"{setting}: found {len(given)} names; the robot has {len(axes)} axes, {', '.join(axes)}: name the log's "
-            "joint of each, in this order"
-        )
-    missing = [name for name in given if name not in found]
-    if missing:
-        raise SettingsError(f"{setting}: {missing[0]!r} is not in the log; its joints are {_list_names(found)}")
-    return dict(zip(axes, given, strict=True))
-
-
-def _plain(name: str) -> str:
-    return "".join(letter for letter in name.casefold() if letter.isalnum())
-
-
-def _beyond(found: Sequence[str], axes: Sequence[str]) -> list[str]:
-    """Returns joints that are numbered like the axes but are none of them."""
-    numbered = [re.fullmatch(r"(.*?)(\d+)", _plain(axis)) for axis in axes]
-    stems = {match[1] for match in numbered if match}
-    if not all(numbered) or len(stems) != 1:
-        return []
-    known = {(match[1], int(match[2])) for match in numbered if match}
-    others = ((name, re.fullmatch(r"(.*?)(\d{1,3})", _plain(name))) for name in found)
-    return [name for name, match in others if match and match[1] in stems and (match[1], int(match[2])) not in known]
-
-
-def _unfit(topics: Sequence[JointTopic], axes: Sequence[str], more: Sequence[str], where: str) -> LogError:
-    found = list(dict.fromkeys(name for topic in topics for name in topic.joints))
-    nameless = sum(name.startswith(_NAMELESS) for name in found)
-    told = f"{nameless} positions without names" if nameless == len(found) else f"joints {_list_names(found)}"
-    ends = [[name for name in found if _plain(name).endswith(_plain(axis))] for axis in axes]
-    likely = [names[0] for names in ends if len(names) == 1]
-    example = likely if len(set(likely)) == len(axes) else [f"name of {axis}" for axis in axes]
-    setting = ", ".join(f'"{name}"' for name in example)
-    why = f" ({_list_names(more)} would be one more of them)" if more else ""
-    return LogError(
-        f"{where}: {', '.join(topic.name for topic in topics)}: found {told}; the robot's axes are "
-        f"{', '.join(axes)}{why}. Name the log's joints in the order of the axes, "
-        f"--set 'logs.joint_names=[{setting}]', or the robot that was recorded, --set robot.urdf=FILE, "
-        "or give a task in their place, --set plan.task=FILE.toml"
-    )
-
-
-def _list_names(names: Sequence[str]) -> str:
-    most = 20
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def _choose(topics: Sequence[JointTopic], names: Mapping[str, str]) -> dict[str, JointTopic]:
@@ -685,11 +557,11 @@ def coverage_remarks(reading: JointReading, start_ns: int, end_ns: int) -> Itera
     )
 
 
-def _match_names(
+def _name_remarks(
     topics: Sequence[JointTopic], names: Mapping[str, str], chosen: Mapping[str, JointTopic]
 ) -> Iterator[str]:
     """Returns remarks on names other than the robot's, and on joints that are not axes."""
-    if all(name.startswith(_NAMELESS) for name in names.values()):
+    if all(name.startswith(NAMELESS) for name in names.values()):
         order = ", ".join(names)
         yield f"robot joints: {next(iter(chosen.values())).name} has no names; the assumed order is {order}"
     elif list(names.values()) != list(names):
@@ -703,7 +575,7 @@ def _match_names(
     if others:
         moving = {name: f"{name} (moves by {way:.3g})" for name, way in others.items() if way > _AT_REST}
         carrying = "; if a moving one carries the arm, the assumed pose of the robot's base is wrong"
-        ignored = _list_names([moving.get(name, name) for name in others])
+        ignored = list_names([moving.get(name, name) for name in others])
         yield f"robot joints: ignored, as no axis of the robot: {ignored}{carrying if moving else ''}"
 
 

@@ -47,7 +47,7 @@ def people(count: int, seed: int) -> HumanStates:
 
 
 def residual_of(states: HumanStates, tick: int, limb: str) -> float:
-    """What the departures of a limb are multiples of: of shown legs how far they go in a thirtieth of a second [m]."""
+    """What the departures of a limb are multiples of: of shown legs their sway [m]."""
     if limb != "LEGS":
         return float(states.residual_m[tick, BODY.index(limb)])
     assert states.legs_sway_m is not None
