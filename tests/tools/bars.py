@@ -19,8 +19,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
+from hrcreplay.records import Ints
 from tests import crowd
 from tests.live.flights import DEMO
 from tests.live.sessions import Session, Twin, every_fault, free_port
@@ -29,6 +31,9 @@ _SHARES = ("p50", "p99", "p99.9", "max")
 P50_US = 1000.0
 RECORDED_S = 50.0  #: the demo log's
 TAIL_US = 1500.0  #: over the echo loop's
+#: Answers further apart than a cycle and a half are a pause. Pauses of both within ``TOGETHER_NS`` are the computer's,
+#: which let neither run. A pause of a loop together with its double loses no packet, as none was sent.
+PAUSE_NS, TOGETHER_NS = 6_000_000, 20_000_000
 
 
 def measure(out: Path, seconds: float, human: Path, *, faults: bool) -> tuple[dict[str, Any], dict[str, Any], Session]:
@@ -84,6 +89,24 @@ def table(bare: dict[str, Any], live: dict[str, Any]) -> Iterator[str]:
     yield f"{'overruns of the double':24}{bare['overruns']:>12}{live['overruns']:>12}"
 
 
+def pauses_ns(folder: Path) -> Ints:
+    """When a pause between two answers began, on the clock that all doubles share."""
+    t_ns = pd.read_csv(folder / "twin_arrivals.csv", usecols=["t_ns"])["t_ns"].to_numpy()
+    return np.asarray(t_ns[:-1][np.diff(t_ns) > PAUSE_NS])
+
+
+def together(mine_ns: Ints, yours_ns: Ints) -> int:
+    """How many of the first pauses began while one of the others did."""
+    return sum(bool((np.abs(yours_ns - at_ns) <= TOGETHER_NS).any()) for at_ns in mine_ns)
+
+
+def paused(out: Path) -> Iterator[str]:
+    """Pauses of both, and those that came to both at the same time."""
+    yours, mine = pauses_ns(out / "echo"), pauses_ns(out / "twin")
+    yield f"{'pauses over 6 ms':24}{len(yours):>12}{len(mine):>12}"
+    yield f"{'at the same time':24}{together(yours, mine):>12}{together(mine, yours):>12}"
+
+
 def short(bare: dict[str, Any], live: dict[str, Any], verified: str, found: list[str], *, faults: bool) -> list[str]:
     """The bars that are not reached."""
     mine, yours = live["answers"]["latency_us"], bare["answers"]["latency_us"]
@@ -118,7 +141,8 @@ def main() -> int:
         human = crowd.write(out / "people.mcap", crowd.record(*people))
     bare, live, session = measure(out, given.seconds, human, faults=given.faults)
     verified, found = verdict(session.folder), stops(session.folder)
-    sys.stdout.write("\n".join(table(bare, live)) + f"\nstops of the session: {', '.join(found) or 'none'}\n")
+    sys.stdout.write("\n".join([*table(bare, live), *paused(out)]) + "\n")
+    sys.stdout.write(f"stops of the session: {', '.join(found) or 'none'}\n")
     sys.stdout.write(f"the robot moved in {moving(session.folder):.0%} of the ticks\n")
     sys.stdout.write(f"sessions of the double: {live['sessions']}\nverify: {verified}\nall of it: {out}\n")
     wrong = short(bare, live, verified, found, faults=given.faults)
