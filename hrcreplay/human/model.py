@@ -52,10 +52,11 @@ _DEGREE = np.pi / 180.0
 class Departure:
     """Measured bounds on the departure of whole limbs from constant velocity.
 
-    The body may be up to ``rise_m`` higher and ``sink_m`` lower than at constant velocity. Take the hull of the limb at
-    the tick and at all these later positions (``human.prediction.velocity_tube``). Up to a horizon, no point of the
-    limb is further from this hull than ``beyond_m``, plus ``swings_s`` times the limb's present speed, plus
-    ``residuals`` times its residual, as far as that is noise; the bound is at least the residual.
+    Take the hull of a limb at the tick and at its later positions at constant velocity
+    (``human.prediction.velocity_tube``); head, trunk and pelvis may be up to ``rise_m`` higher and ``sink_m`` lower.
+    Up to a horizon, no point of the limb is further from this hull than ``beyond_m``, plus ``swings_s`` times the
+    limb's present speed, plus ``residuals`` times its residual, as far as that is noise; the bound is at least the
+    residual.
     """
 
     horizon_s: Floats  #: (h,) increasing [s]

@@ -2,9 +2,10 @@
 
 Worst-case bounds on thirteen joints enclose two to three times the volume that people use. So a limit set may also
 bound the departure of whole limbs from constant velocity (``Departure``), fitted on recordings. The tube of a limb is
-the hull of its ends at the tick and after the horizon, raised and lowered as people stand up and sit down, with a ball
-around it; a person who stops or slows down stays in that hull. No motion within the bound leaves the tube, for any
-motion of the joints. Where a camera shows a limb away from the fused one, the hull contains both.
+the hull of its ends at the tick and after the horizon, with a ball around it; a person who stops or slows down stays in
+that hull. Of trunk and head the hull is also raised and lowered as people stand up and sit down. No motion within the
+bound leaves the tube, for any motion of the joints. Where a camera shows a limb away from the fused one, the hull
+contains both.
 
 The ball is the sum of where the limb is now (a multiple of its residual) and of where it can go. The latter grows with
 the limb's present speed: someone who swings an arm already departs further than someone who stands still.
@@ -291,7 +292,8 @@ def tube(
 ) -> int:
     """Writes the points whose hull is a limb's tube before the ball, in place of Alg. 2; returns their number.
 
-    The hand lies along the forearm and at its observed position. Of the lower body the pelvis rises and sinks.
+    The hand lies along the forearm and at its observed position. Trunk, head and, of the lower body, the pelvis rise
+    and sink; arms move by themselves as far as with a body that rises, so that their balls contain both.
 
     Args:
         limb: Index into BODY.
@@ -309,7 +311,7 @@ def tube(
     unmeasured_s = max(0.0, span_s - table.horizon_s[-1])  # for these points only the velocity is known
     carries_s = min(span_s, carries_s + unmeasured_s)
     n = _ends(limb, points, shown, velocity, carries_s, hand_m, legs_new, swept)
-    rising = n
+    rising = n if limb in (HEAD_LIMB, THORAX) else 0
     if limb == LEGS:
         rising = 2
         for c in range(len(shown)):
