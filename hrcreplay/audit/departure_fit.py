@@ -2,12 +2,13 @@
 
 First rise and sink are fitted by a quantile, as the whole body moves with the pelvis. Then quantile regression gives
 each pair of limbs and horizon a multiple of the residual, which is where the limb is now, and where it can go from
-there: an offset, and a slope over its present speed. The lines lie above the required share of the departures. Then
-those that cost the least volume are raised, until whole people, not single limbs, are inside in the required share of
-the ticks of every log and of all together; of those with ground truth almost completely, as their misses are not camera
-errors. Simulated people, with an unlimited number of ticks, do not count in totals over the ticks of all logs. Last,
-people whom no fit has seen depart further than those of the fit: by one factor per horizon all lines are widened to
-what the people of each group need on lines that were fitted without them (``others_need``).
+there: an offset, and a slope over its present speed. The lines lie above most of the departures. Then the offsets that
+cost the least volume are raised, until whole people, not single limbs, are inside in the required share of the ticks of
+every log and of all together; of those with ground truth almost completely, as their misses are not camera errors. It
+is the offsets, as those who leave the lines are mostly at rest and begin to move; slopes would widen what moves
+already, and what is noisy. Simulated people, with an unlimited number of ticks, do not count in totals over the ticks of all
+logs. Last, people whom no fit has seen depart further than those of the fit: by one factor per horizon all lines are
+widened to what the people of each group need on lines that were fitted without them (``others_need``).
 """
 
 from __future__ import annotations
@@ -27,10 +28,10 @@ from hrcreplay.records import BODY, Bools, Floats
 #: Limbs that share a line: both sides of the body.
 _PAIRS = ((0,), (1,), (2, 4), (3, 5), (6,))
 _LEGS = BODY.index("LEGS")
-#: Share of a pair's departures below its line before the line is raised.
-_BELOW = 0.99
-#: Share of all rises and sinks of the pelvis below theirs.
-_RISEN = 0.995
+#: Share of a pair's departures below its line before the line is raised; less than is asked for, as raising is cheaper.
+_BELOW = 0.97
+#: Share of all rises and sinks of the pelvis below theirs, and the time by which its fused velocity is late [s].
+_RISEN, _LATE_S = 0.995, 0.05
 #: Maximum multiple of the residual of each pair; a larger one comes from the few logs with much noise. The residual of
 #: legs is their sway, a motion, of which a departure is several times as large.
 _STEEPEST = (1.0, 1.0, 1.0, 1.0, 8.0)
@@ -39,11 +40,11 @@ _STEEPEST = (1.0, 1.0, 1.0, 1.0, 8.0)
 _BEGINS_M_PER_S2 = 5.0
 #: Maximum slope over the speed: the time for which a limb's tube does not carry it, and for the filter's lag [s].
 _SWINGS_S = 0.3
-#: Maximum factor on a line, and that for logs with ground truth; a larger one comes from the few ticks at which a
-#: tracker throws a limb.
-_MOST, _MOST_TRUE = 1.4, 2.25
+#: Maximum departure in lines at which a tick is asked for; larger ones come from the few ticks at which a tracker
+#: throws a limb. In logs with ground truth none does.
+_MOST = 1.4
 #: Least and maximum factor for people who were not in the fit, and the step in which it is found.
-_LEAST_OTHERS, _MOST_OTHERS, _STEP = 1.05, 1.5, 0.01
+_LEAST_OTHERS, _MOST_OTHERS, _STEP = 1.02, 1.5, 0.01
 #: Factors on the requested share of misses: for a log that was left out; in the fit, for each log, for each log with
 #: ground truth, and for all logs together; and for people outside the fit, who choose how far lines are widened.
 EACH, _FITTED, _TRUE, _TOGETHER, _OTHERS = 3.0, 2.25, 0.3, 1.2, 0.95
@@ -63,8 +64,8 @@ def fit(samples: Sequence[LimbDepartures], share: float) -> Departure:
     horizon_s = samples[0].horizon_s
     rise_m, sink_m = (_rise(horizon_s, [s.height_m[way] for s in samples]) for way in range(2))
     plain = _lines(samples, horizon_s, rise_m, sink_m)
-    factors = [_raise(samples, plain, k, share) for k in range(len(horizon_s))]
-    return _rounded(_begun(_times(plain, np.column_stack(factors))))
+    raised_m = [_raise(samples, plain, k, share) for k in range(len(horizon_s))]
+    return _rounded(_begun(replace(plain, beyond_m=plain.beyond_m + np.column_stack(raised_m))))
 
 
 def _lines(samples: Sequence[LimbDepartures], horizon_s: Floats, rise_m: Floats, sink_m: Floats) -> Departure:
@@ -114,7 +115,7 @@ def others_need(samples: Sequence[LimbDepartures], folds: Sequence[Departure], s
     pooled = [pair for pair, counts in zip(zip(samples, folds, strict=True), counted(samples), strict=True) if counts]
     found = np.ones(len(folds[0].horizon_s))
     for k in range(len(found)):
-        needed = np.concatenate([_needed([one], fold, k)[0].max(axis=1) for one, fold in pooled])
+        needed = np.concatenate([_needed([one], fold, k)[0][0].max(axis=1) for one, fold in pooled])
         if len(needed):
             found[k] = np.quantile(needed, 1.0 - _OTHERS * (1.0 - share), method="higher")
     return np.clip(_up(found, _STEP), _LEAST_OTHERS, _MOST_OTHERS)
@@ -137,11 +138,11 @@ def _times(departure: Departure, factor: Floats) -> Departure:
 def _rise(horizon_s: Floats, logs: Sequence[Floats]) -> Floats:
     """(h,) maximum rise, or sink, of the pelvis in nearly all ticks; input: (h, n) of each log [m].
 
-    Before the last horizon, at most that of a constant acceleration until then; the rest is noise, which the ball
-    covers.
+    Before the last horizon, at most that of a constant acceleration until then, which the filter follows late; the rest
+    is noise, which the ball covers.
     """
     last = _often([log[-1] for log in logs])
-    evenly = last * (horizon_s / horizon_s[-1]) ** 2
+    evenly = last * ((horizon_s + _LATE_S) / (horizon_s[-1] + _LATE_S)) ** 2
     return _up(np.array([min(_often([log[k] for log in logs]), evenly[k]) for k in range(len(horizon_s))]), _CM)
 
 
@@ -186,53 +187,67 @@ def _line(departed: Sequence[Floats], over: Sequence[Sequence[Floats]], most: Se
     return line
 
 
-def _needed(samples: Sequence[LimbDepartures], departure: Departure, k: int) -> list[Floats]:
-    """(n, 7) per log: ``factors`` at the ticks at which any limb was recorded, 0 for unrecorded limbs."""
-    factors = [s.factors(departure, k) for s in samples]
-    return [np.nan_to_num(of[np.isfinite(of).any(axis=1)]) for of in factors]
-
-
 def _raise(samples: Sequence[LimbDepartures], departure: Departure, k: int, share: float) -> Floats:
-    """(7,) factors on the lines at a horizon that contain the people of each log and of all recordings together.
+    """(7,) additions to the offsets at a horizon that contain people of each log and of all recordings together [m].
 
-    The limbs of a pair share a factor. The ticks outside are included one after the other, the one that costs the least
-    volume first, until enough are inside or only ticks beyond the largest factor remain: those of a tracker that throws
-    a limb away.
+    The limbs of a pair share one. The ticks outside are included one after the other, the one that costs the least
+    volume first, until enough are inside or only those remain at which a tracker throws a limb away.
     """
-    needed = _needed(samples, departure, k)
-    log = np.repeat(np.arange(len(samples)), [len(of) for of in needed])
-    pairs = np.column_stack([np.concatenate(needed)[:, list(pair)].max(axis=1) for pair in _PAIRS])
+    factors, more_m = _needed(samples, departure, k)
+    log = np.repeat(np.arange(len(samples)), [len(of) for of in factors])
+    factor, more = _of_pairs(factors), _of_pairs(more_m)
     true, pooled = np.array([sample.true for sample in samples]), np.array(counted(samples))[log]
     wanted = (1.0 - np.where(true, _TRUE, _FITTED) * (1.0 - share)) * np.bincount(log, minlength=len(samples))
     together = (1.0 - _TOGETHER * (1.0 - share)) * pooled.sum()
-    weight, found = _weights(samples, departure, k), np.ones(len(_PAIRS))
-    most = np.array([_MOST_TRUE if sample.true else _MOST for sample in samples])
-    possible: Bools = np.asarray((pairs <= most[log][:, None]).all(axis=1))
+    radius, limbs, found = (
+        _radii_m(samples, departure, k),
+        np.array([len(pair) for pair in _PAIRS]),
+        np.zeros(len(_PAIRS)),
+    )
+    possible: Bools = np.asarray((factor <= np.where(true, np.inf, _MOST)[log][:, None]).all(axis=1))
     asks = np.bincount(log[possible], minlength=len(samples)) >= wanted - EXACT
     while True:
-        held: Bools = np.asarray((pairs <= found + EXACT).all(axis=1))
+        held: Bools = np.asarray((more <= found + EXACT).all(axis=1))
         lacks = asks & (np.bincount(log[held], minlength=len(samples)) < wanted - EXACT)
         asked = possible & ~held
-        outside = pairs[asked & lacks[log]]
+        outside = more[asked & lacks[log]]
         if not len(outside) and held[pooled].sum() < together - EXACT:
-            outside = pairs[asked & pooled]
+            outside = more[asked & pooled]
         if not len(outside):
             break
         raised = np.maximum(outside, found)
-        found = raised[np.argmin((raised**2 - found**2) @ weight)]
-    factors = np.ones(len(BODY))
-    for pair, factor in zip(_PAIRS, found, strict=True):
-        factors[list(pair)] = factor
-    return factors
+        found = raised[np.argmin(((radius + raised) ** 2 - (radius + found) ** 2) @ limbs)]
+    added_m = np.zeros(len(BODY))
+    for pair, added in zip(_PAIRS, found, strict=True):
+        added_m[list(pair)] = added
+    return added_m
 
 
-def _weights(samples: Sequence[LimbDepartures], departure: Departure, k: int) -> Floats:
-    """(pairs,) costs of the tubes of a pair: their cross-sections, which grow with the square of the radius."""
-    noise = np.minimum(np.concatenate([s.residual_m for s in samples]), NOISE_M)
-    speed = np.concatenate([s.speed_m_per_s for s in samples])
-    radius_m = departure.beyond_m[:, k] + departure.residuals[:, k] * noise.mean(axis=0)
-    radius_m = radius_m + _swings(departure)[:, k] * speed.mean(axis=0)
-    return np.array([(radius_m[list(pair)] ** 2).sum() for pair in _PAIRS])
+def _needed(samples: Sequence[LimbDepartures], departure: Departure, k: int) -> tuple[list[Floats], list[Floats]]:
+    """(n, 7) per log at the ticks at which any limb was recorded: ``factors``, and what must be added to the lines [m].
+
+    For limbs that were not recorded 0, and -inf.
+    """
+    factors, more_m = [], []
+    for sample in samples:
+        of = sample.factors(departure, k)
+        recorded = np.isfinite(of).any(axis=1)
+        more = np.where(np.isfinite(of), (of - 1.0) * sample.lines_m(departure, k), -np.inf)
+        factors.append(np.nan_to_num(of[recorded]))
+        more_m.append(more[recorded])
+    return factors, more_m
+
+
+def _of_pairs(of_limbs: Sequence[Floats]) -> Floats:
+    """(n, pairs) the larger of each pair, of all logs, from (n, 7) per log."""
+    every = np.concatenate(of_limbs)
+    return np.column_stack([every[:, list(pair)].max(axis=1) for pair in _PAIRS])
+
+
+def _radii_m(samples: Sequence[LimbDepartures], departure: Departure, k: int) -> Floats:
+    """(pairs,) mean radii of the tubes; the cross-section of a tube, its cost, grows with the square."""
+    mean = np.concatenate([sample.lines_m(departure, k) for sample in samples]).mean(axis=0)
+    return np.array([mean[pair[0]] for pair in _PAIRS])
 
 
 def _up(values: Floats, step: float) -> Floats:

@@ -74,12 +74,16 @@ class LimbDepartures:
         NaN if a limb was not recorded.
         """
         beyond = self.beyond_m(k, float(departure.rise_m[k]), float(departure.sink_m[k]))
-        noise = np.minimum(self.residual_m, NOISE_M)
-        line = departure.beyond_m[:, k] + departure.residuals[:, k] * noise
+        apart = np.maximum(self.residual_m - NOISE_M, 0.0)
+        needed = (beyond - apart) / self.lines_m(departure, k)
+        return np.where(beyond <= self.residual_m, 0.0, needed)
+
+    def lines_m(self, departure: Departure, k: int) -> Floats:
+        """(n, 7) heights of the lines at a horizon, above 0 [m]."""
+        line = departure.beyond_m[:, k] + departure.residuals[:, k] * np.minimum(self.residual_m, NOISE_M)
         if departure.swings_s is not None:
             line += departure.swings_s[:, k] * self.speed_m_per_s
-        needed = (beyond - (self.residual_m - noise)) / np.maximum(line, EXACT)
-        return np.where(beyond <= self.residual_m, 0.0, needed)
+        return np.maximum(line, EXACT)
 
 
 def departures(stage: PredictionStage, recording: Recording, ticks: Ints) -> LimbDepartures:

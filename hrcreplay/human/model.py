@@ -53,10 +53,9 @@ class Departure:
     """Measured bounds on the departure of whole limbs from constant velocity.
 
     Take the hull of a limb at the tick and at its later positions at constant velocity
-    (``human.prediction.velocity_tube``); head, trunk and pelvis may be up to ``rise_m`` higher and ``sink_m`` lower.
-    Up to a horizon, no point of the limb is further from this hull than ``beyond_m``, plus ``swings_s`` times the
-    limb's present speed, plus ``residuals`` times its residual, as far as that is noise; the bound is at least the
-    residual.
+    (``human.prediction.velocity_tube``), up to ``rise_m`` higher and ``sink_m`` lower, but arms by 0.06 m at most. Up
+    to a horizon, no point of the limb is further from this hull than ``beyond_m``, plus ``swings_s`` times the limb's
+    present speed, plus ``residuals`` times its residual, as far as that is noise; the bound is at least the residual.
     """
 
     horizon_s: Floats  #: (h,) increasing [s]

@@ -2,10 +2,11 @@
 
 Worst-case bounds on thirteen joints enclose two to three times the volume that people use. So a limit set may also
 bound the departure of whole limbs from constant velocity (``Departure``), fitted on recordings. The tube of a limb is
-the hull of its ends at the tick and after the horizon, with a ball around it; a person who stops or slows down stays in
-that hull. Of trunk and head the hull is also raised and lowered as people stand up and sit down. No motion within the
-bound leaves the tube, for any motion of the joints. Where a camera shows a limb away from the fused one, the hull
-contains both.
+the hull of its ends at the tick and after the horizon, raised and lowered as people stand up and sit down, with a ball
+around it; a person who stops or slows down stays in that hull. Arms are raised and lowered by a few centimetres only:
+they move by themselves as far as with a body that rises, and their balls contain both. No motion within the bound
+leaves the tube, for any motion of the joints. Where a camera shows a limb away from the fused one, the hull contains
+both.
 
 The ball is the sum of where the limb is now (a multiple of its residual) and of where it can go. The latter grows with
 the limb's present speed: someone who swings an arm already departs further than someone who stands still.
@@ -38,6 +39,8 @@ _LEGS_AGE_S = 0.07
 #: Sway of legs, ``HumanStates.legs_sway_m``, that counts at least; that counts at most, as of people who walk, whose
 #: legs a tracker throws, or whose sway is not known; and of legs out of sight, as of somebody on one spot [m].
 _LEAST_SWAY_M, _MOST_SWAY_M, _HIDDEN_SWAY_M = 0.008, 0.03, 0.018
+#: Maximum rise, and sink, of an arm's hull [m].
+_ARMS_RISE_M = 0.06
 #: Minimum distance of a hand from its wrist that gives a direction [m].
 _SHORT_M = 0.02
 HEAD_LIMB, THORAX, LEGS = (BODY.index(limb) for limb in ("HD", "THX", "LEGS"))
@@ -292,8 +295,7 @@ def tube(
 ) -> int:
     """Writes the points whose hull is a limb's tube before the ball, in place of Alg. 2; returns their number.
 
-    The hand lies along the forearm and at its observed position. Trunk, head and, of the lower body, the pelvis rise
-    and sink; arms move by themselves as far as with a body that rises, so that their balls contain both.
+    The hand lies along the forearm and at its observed position. Of the lower body the pelvis rises and sinks.
 
     Args:
         limb: Index into BODY.
@@ -311,13 +313,15 @@ def tube(
     unmeasured_s = max(0.0, span_s - table.horizon_s[-1])  # for these points only the velocity is known
     carries_s = min(span_s, carries_s + unmeasured_s)
     n = _ends(limb, points, shown, velocity, carries_s, hand_m, legs_new, swept)
-    rising = n if limb in (HEAD_LIMB, THORAX) else 0
+    rising = n
     if limb == LEGS:
         rising = 2
         for c in range(len(shown)):
             rising += 2 * np.isfinite(shown[c, PELVIS, 0])
     sink_m = _until(reach_s, table.horizon_s, table.sink_m)
     rise_m = _until(reach_s, table.horizon_s, table.rise_m)
+    if limb not in (HEAD_LIMB, THORAX, LEGS):
+        rise_m, sink_m = min(rise_m, _ARMS_RISE_M), min(sink_m, _ARMS_RISE_M)
     for i in range(rising):
         swept[n + i] = swept[i]
         swept[n + i, 2] -= sink_m

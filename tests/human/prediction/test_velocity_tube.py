@@ -73,7 +73,7 @@ def looks(states: HumanStates, tick: int, names: tuple[str, ...]) -> list[dict[s
 
 
 def ends(states: HumanStates, tick: int, limb: str, departure: Departure, horizon_s: float) -> Floats:
-    """(k, 3) the limb's ends now and where they are carried; if no arm, also as high and as low as the body may be."""
+    """(k, 3) the limb's ends now and where they are carried, as high and as low as the body may be."""
     speed = velocities(states, tick)
     carried = 0.15 if "A" in limb else 0.25
     carried = min(horizon_s, carried + max(0.0, horizon_s - 0.377))
@@ -94,12 +94,9 @@ def ends(states: HumanStates, tick: int, limb: str, departure: Departure, horizo
             for along in (wrist - elbow, place[hand] - wrist):
                 now.append(wrist + HAND_M * along / np.linalg.norm(along))
                 going.append(turning)
-        places = now + [p + v * carried for p, v in zip(now, going, strict=True)]
-        if limb in ("HD", "THX"):
-            rising += places
-        else:
-            still += places
+        rising += now + [p + v * carried for p, v in zip(now, going, strict=True)]
     rise, sink = (at_horizon(departure, row, horizon_s) for row in (departure.rise_m, departure.sink_m))
+    rise, sink = (min(by, 0.06 if "A" in limb else by) for by in (rise, sink))
     high, low = ([p + np.array([0.0, 0.0, by]) for p in rising] for by in (rise, -sink))
     return np.array(still + rising + high + low)
 
