@@ -2,13 +2,13 @@
 
 First rise and sink are fitted by a quantile, as the whole body moves with the pelvis. Then quantile regression gives
 each pair of limbs and horizon a multiple of the residual, which is where the limb is now, and where it can go from
-there: an offset, and a slope over its present speed. The lines lie above most of the departures. Then the offsets that
-cost the least volume are raised, until whole people, not single limbs, are inside in the required share of the ticks of
-every log and of all together; of those with ground truth almost completely, as their misses are not camera errors. It
-is the offsets, as those who leave the lines are mostly at rest and begin to move; slopes would widen what moves
-already, and what is noisy. Simulated people, with an unlimited number of ticks, do not count in totals over the ticks of all
-logs. Last, people whom no fit has seen depart further than those of the fit: by one factor per horizon all lines are
-widened to what the people of each group need on lines that were fitted without them (``others_need``).
+there: an offset, and a slope over its present speed. The lines lie above most of the departures. Then the offsets
+that cost the least volume are raised, until whole people, not single limbs, are inside in the required share of the
+ticks of every log and of all together; of those with ground truth almost completely, as their misses are not camera
+errors. It is the offsets, as those who leave the lines are mostly at rest and begin to move; slopes would widen what
+moves already, and what is noisy. Simulated people, with an unlimited number of ticks, do not count in totals over the
+ticks of all logs. Last, people whom no fit has seen depart further than those of the fit: by one factor per horizon
+all lines are widened to what the people of each group need on lines that were fitted without them (``others_need``).
 """
 
 from __future__ import annotations

@@ -117,18 +117,19 @@ def test_departures_that_do_not_grow_with_the_residual_get_no_slope() -> None:
     one = log(400, seed=6)
     beyond = np.random.default_rng(7).uniform(0.0, 0.3, (2, *one.residual_m.shape))
     found = fit([given(beyond, one.residual_m)], 0.99)
-    assert (found.residuals < 0.1).all()
+    assert (found.residuals < 0.15).all()
     np.testing.assert_allclose(found.beyond_m, 0.3, atol=0.02)
 
 
-def test_lines_that_hold_too_few_are_raised_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lines_that_hold_too_few_are_raised_and_no_steeper(monkeypatch: pytest.MonkeyPatch) -> None:
     logs = [log(400, seed) for seed in (2, 3, 4)]
-    wanted = fit(logs, 0.9)
     monkeypatch.setattr(departure_fit, "_BELOW", 0.8)
     found = fit(logs, 0.9)
     for k in range(2):
         assert np.mean([plain_share(one, found, k) for one in logs]) >= 1.0 - 0.1 * departure_fit._TOGETHER
-    assert (found.residuals < 1.3 * wanted.residuals).all()
+    plain = departure_fit._lines(logs, HORIZONS_S, np.zeros(2), np.zeros(2))
+    np.testing.assert_array_equal(found.residuals, plain.residuals)
+    assert (found.beyond_m[:-1] > plain.beyond_m[:-1]).any(axis=1).all()
 
 
 def test_a_person_who_departs_further_counts_as_much_as_the_others() -> None:
@@ -170,7 +171,7 @@ def test_ticks_of_simulated_people_are_not_counted_with_those_of_recorded_ones()
     assert departure_fit.counted([simulated, simulated]) == [True, True]
     found = fit([recorded, simulated], 0.95)
     for k in range(2):
-        assert plain_share(recorded, found, k) >= 0.95
+        assert plain_share(recorded, found, k) >= 1.0 - 0.05 * departure_fit._TOGETHER
 
 
 def test_a_limb_that_was_never_recorded_has_no_departure_and_is_named() -> None:
@@ -213,8 +214,10 @@ def test_rise_and_sink_are_a_quantile_in_which_each_log_weighs_as_its_root() -> 
     for row, way in ((found.rise_m, 0), (found.sink_m, 1)):
         for k in range(2):
             known = [height[way, k][np.isfinite(height[way, k])] for height in heights]
-            if k == 0:  # before the last horizon at most who accelerates evenly until then, rounded up to 1 cm
-                assert row[0] == pytest.approx(np.ceil(100.0 * row[1] / 16.0 - 1.0) / 100.0, abs=0.0101)
+            if (
+                k == 0
+            ):  # before the last horizon at most who accelerates evenly until then, seen 50 ms late, rounded up to 1 cm
+                assert row[0] == pytest.approx(np.ceil(100.0 * row[1] / 9.0 - 1.0) / 100.0, abs=0.0101)
                 continue
             above = sum(len(h) ** -0.5 * (h > row[k]).sum() for h in known) / sum(len(h) ** 0.5 for h in known)
             lower = sum(len(h) ** -0.5 * (h > row[k] - 0.01).sum() for h in known) / sum(len(h) ** 0.5 for h in known)
@@ -232,11 +235,11 @@ def test_departures_are_beside_the_rise_and_sink_that_are_fitted() -> None:
         return np.full((200, len(BODY)), (0.1, 0.5)[k] - min(rise_m, sink_m))
 
     found = fit([departures_of(1, height, beyond, residual)], 0.99)
-    assert set(asked) == {(0.02, 0.02), (0.2, 0.2)}
-    assert found.rise_m.tolist() == found.sink_m.tolist() == [0.02, 0.2]
+    assert set(asked) == {(0.03, 0.03), (0.2, 0.2)}
+    assert found.rise_m.tolist() == found.sink_m.tolist() == [0.03, 0.2]
     reach = found.beyond_m + 0.02 * found.residuals
-    np.testing.assert_allclose(reach[:-1], np.tile([0.08, 0.3], (len(LIMBS), 1)), atol=2e-3)
-    np.testing.assert_allclose(reach[-1], [0.08 + begun_m(0.1), 0.3], atol=2e-3)
+    np.testing.assert_allclose(reach[:-1], np.tile([0.07, 0.3], (len(LIMBS), 1)), atol=2e-3)
+    np.testing.assert_allclose(reach[-1], [0.07 + begun_m(0.1), 0.3], atol=2e-3)
 
 
 @pytest.mark.parametrize("true", [False, True])
