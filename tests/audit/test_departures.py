@@ -20,6 +20,8 @@ from tests.human.people import states
 
 #: What people do upwards [m/s], how often it is recorded [s], and the residual that they are said to have [m].
 UP_M_PER_S, EVERY_S, RESIDUAL_M = 1.6, 0.02, 0.02
+#: As far as arms rise with the body in the volumes [m].
+ARMS_RISE_M = 0.06
 
 
 def standing() -> HumanStates:
@@ -71,16 +73,22 @@ def test_a_body_that_rises_departs_by_what_the_rise_does_not_hold(sign: float) -
         assert (0.9 * moved <= found).all()  # a forearm leaves by its wrist, which the hand's tube holds a little
         assert (found <= moved + 1e-6).all()
         held = (moved, 0.0) if sign > 0.0 else (0.0, moved)
-        np.testing.assert_allclose(of.beyond_m(k, *held)[0, : len(LIMBS)], 0.0, atol=1e-6)
+        left = of.beyond_m(k, *held)[0, : len(LIMBS)]
+        np.testing.assert_allclose(left[:2], 0.0, atol=1e-6)
+        np.testing.assert_allclose(left[[2, 4]], max(0.0, moved - ARMS_RISE_M), atol=1e-6)
+        assert (left[[3, 5]] <= max(0.0, moved - ARMS_RISE_M) + 1e-6).all()
         assert np.isnan(of.beyond_m(k, 0.0, 0.0)[0, BODY.index("LEGS")])  # no camera has shown them
 
 
 def test_who_rises_by_more_than_the_rise_and_the_residual_is_outside() -> None:
     of = risen(UP_M_PER_S)
     far = gone_m(of)
-    for more_m, inside in ((0.9 * RESIDUAL_M, 1.0), (1.1 * RESIDUAL_M, 0.0)):
-        for k in range(len(far)):
-            assert of.inside(lines(of, np.maximum(far - more_m, 0.0)), k).tolist() == [inside]
+    assert far[0] < ARMS_RISE_M < far[-1]
+    for more_m, inside in ((0.9 * RESIDUAL_M, True), (1.1 * RESIDUAL_M, False)):
+        for k, moved in enumerate(far):
+            rising = lines(of, np.maximum(far - more_m, 0.0))
+            assert (of.factors(rising, k)[0, :2] <= 1.0).tolist() == [inside, inside]
+            assert of.inside(rising, k).tolist() == [inside and moved < ARMS_RISE_M + RESIDUAL_M]
 
 
 def test_a_limb_seen_longer_ago_is_not_measured_and_the_truth_is_known_as_such() -> None:
