@@ -331,7 +331,7 @@ def test_hidden_legs_are_the_line_below_the_pelvis_as_thick_as_they_were(gone: t
         line = np.linspace([pelvis[0], pelvis[1], 0.0], pelvis, 5)
         shown = [points[tick, POINTS.index(name)] for name in LEGS if name not in gone]
         assert max(distance_m(point, volumes.vertices(tick, k)) for point in [*line, *shown]) < 1e-5
-        reach = allowed_m(PEOPLE.departure, "LEGS", 0.1, 0.02, 0.0)  # like somebody who works on one spot
+        reach = allowed_m(PEOPLE.departure, "LEGS", 0.1, 0.022, 0.0)  # like somebody who works on one spot
         reach = max(reach, states.residual_m[tick, BODY.index("THX")])
         bent = np.sqrt(max(0.0, 0.47**2 - (0.5 * states.p[tick, 12]) ** 2))
         thick = max(0.20 + 0.09, bent + 0.08 + 0.09, states.residual_m[tick, k] + 0.08)
