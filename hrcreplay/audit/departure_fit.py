@@ -28,7 +28,8 @@ from hrcreplay.records import BODY, Bools, Floats
 #: Limbs that share a line: both sides of the body.
 _PAIRS = ((0,), (1,), (2, 4), (3, 5), (6,))
 _LEGS = BODY.index("LEGS")
-#: Share of a pair's departures below its line before the line is raised; less than is asked for, as raising is cheaper.
+#: Share of a pair's departures below its line before its offset is raised. Less than is asked for: an offset raised for
+#: those who begin to move takes less volume than a steep line that holds them.
 _BELOW = 0.97
 #: Share of all rises and sinks of the pelvis below theirs, and the time by which its fused velocity is late [s].
 _RISEN, _LATE_S = 0.995, 0.05
@@ -40,8 +41,8 @@ _STEEPEST = (1.0, 1.0, 1.0, 1.0, 8.0)
 _BEGINS_M_PER_S2 = 5.0
 #: Maximum slope over the speed: the time for which a limb's tube does not carry it, and for the filter's lag [s].
 _SWINGS_S = 0.3
-#: Maximum departure in lines at which a tick is asked for; larger ones come from the few ticks at which a tracker
-#: throws a limb. In logs with ground truth none does.
+#: Maximum departure, as a multiple of the line, for which an offset is raised; larger ones come from the few ticks at
+#: which a tracker throws a limb. In logs with ground truth none does.
 _MOST = 1.4
 #: Least and maximum factor for people who were not in the fit, and the step in which it is found.
 _LEAST_OTHERS, _MOST_OTHERS, _STEP = 1.02, 1.5, 0.01
@@ -115,7 +116,7 @@ def others_need(samples: Sequence[LimbDepartures], folds: Sequence[Departure], s
     pooled = [pair for pair, counts in zip(zip(samples, folds, strict=True), counted(samples), strict=True) if counts]
     found = np.ones(len(folds[0].horizon_s))
     for k in range(len(found)):
-        needed = np.concatenate([_needed([one], fold, k)[0][0].max(axis=1) for one, fold in pooled])
+        needed = np.concatenate([_of_pairs([one.factors(fold, k)]).max(axis=1) for one, fold in pooled])
         if len(needed):
             found[k] = np.quantile(needed, 1.0 - _OTHERS * (1.0 - share), method="higher")
     return np.clip(_up(found, _STEP), _LEAST_OTHERS, _MOST_OTHERS)
@@ -193,17 +194,15 @@ def _raise(samples: Sequence[LimbDepartures], departure: Departure, k: int, shar
     The limbs of a pair share one. The ticks outside are included one after the other, the one that costs the least
     volume first, until enough are inside or only those remain at which a tracker throws a limb away.
     """
-    factors, more_m = _needed(samples, departure, k)
-    log = np.repeat(np.arange(len(samples)), [len(of) for of in factors])
+    factors = [sample.factors(departure, k) for sample in samples]
+    more_m = [(of - 1.0) * sample.lines_m(departure, k) for of, sample in zip(factors, samples, strict=True)]
+    log = np.repeat(np.arange(len(samples)), [_recorded(of).sum() for of in factors])
     factor, more = _of_pairs(factors), _of_pairs(more_m)
     true, pooled = np.array([sample.true for sample in samples]), np.array(counted(samples))[log]
     wanted = (1.0 - np.where(true, _TRUE, _FITTED) * (1.0 - share)) * np.bincount(log, minlength=len(samples))
     together = (1.0 - _TOGETHER * (1.0 - share)) * pooled.sum()
-    radius, limbs, found = (
-        _radii_m(samples, departure, k),
-        np.array([len(pair) for pair in _PAIRS]),
-        np.zeros(len(_PAIRS)),
-    )
+    radius, found = _radii_m(samples, departure, k), np.zeros(len(_PAIRS))
+    limbs = np.array([len(pair) for pair in _PAIRS])
     possible: Bools = np.asarray((factor <= np.where(true, np.inf, _MOST)[log][:, None]).all(axis=1))
     asks = np.bincount(log[possible], minlength=len(samples)) >= wanted - EXACT
     while True:
@@ -223,29 +222,23 @@ def _raise(samples: Sequence[LimbDepartures], departure: Departure, k: int, shar
     return added_m
 
 
-def _needed(samples: Sequence[LimbDepartures], departure: Departure, k: int) -> tuple[list[Floats], list[Floats]]:
-    """(n, 7) per log at the ticks at which any limb was recorded: ``factors``, and what must be added to the lines [m].
-
-    For limbs that were not recorded 0, and -inf.
-    """
-    factors, more_m = [], []
-    for sample in samples:
-        of = sample.factors(departure, k)
-        recorded = np.isfinite(of).any(axis=1)
-        more = np.where(np.isfinite(of), (of - 1.0) * sample.lines_m(departure, k), -np.inf)
-        factors.append(np.nan_to_num(of[recorded]))
-        more_m.append(more[recorded])
-    return factors, more_m
-
-
 def _of_pairs(of_limbs: Sequence[Floats]) -> Floats:
-    """(n, pairs) the larger of each pair, of all logs, from (n, 7) per log."""
-    every = np.concatenate(of_limbs)
+    """(n, pairs) the larger value of each pair at the ticks of all logs at which any limb was recorded.
+
+    From (n, 7) per log, NaN for limbs that were not recorded; -inf if neither of a pair was.
+    """
+    every = np.concatenate([of[_recorded(of)] for of in of_limbs])
+    every = np.where(np.isfinite(every), every, -np.inf)
     return np.column_stack([every[:, list(pair)].max(axis=1) for pair in _PAIRS])
 
 
+def _recorded(of_limbs: Floats) -> Bools:
+    """(n,) True at the ticks at which any limb was recorded."""
+    return np.asarray(np.isfinite(of_limbs).any(axis=1))
+
+
 def _radii_m(samples: Sequence[LimbDepartures], departure: Departure, k: int) -> Floats:
-    """(pairs,) mean radii of the tubes; the cross-section of a tube, its cost, grows with the square."""
+    """(pairs,) mean heights of the lines of each pair's first limb; a tube's cost grows with the square [m]."""
     mean = np.concatenate([sample.lines_m(departure, k) for sample in samples]).mean(axis=0)
     return np.array([mean[pair[0]] for pair in _PAIRS])
 

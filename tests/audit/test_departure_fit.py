@@ -214,9 +214,7 @@ def test_rise_and_sink_are_a_quantile_in_which_each_log_weighs_as_its_root() -> 
     for row, way in ((found.rise_m, 0), (found.sink_m, 1)):
         for k in range(2):
             known = [height[way, k][np.isfinite(height[way, k])] for height in heights]
-            if (
-                k == 0
-            ):  # before the last horizon at most who accelerates evenly until then, seen 50 ms late, rounded up to 1 cm
+            if k == 0:  # at most who accelerates evenly until the last horizon, seen 50 ms late, rounded up to 1 cm
                 assert row[0] == pytest.approx(np.ceil(100.0 * row[1] / 9.0 - 1.0) / 100.0, abs=0.0101)
                 continue
             above = sum(len(h) ** -0.5 * (h > row[k]).sum() for h in known) / sum(len(h) ** 0.5 for h in known)
