@@ -44,7 +44,7 @@ def test_a_robot_that_knows_the_future_is_ahead_of_one_that_predicts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The tool itself, on 2.5 s of the demo with its worker beside the robot."""
-    monkeypatch.setattr(oracle, "RunOptions", partial(RunOptions, start_s=6.0, end_s=8.5))
+    monkeypatch.setattr(oracle, "RunOptions", partial(RunOptions, start_s=16.0, end_s=18.5))
     found = oracle.measure("demo", 2.0, tmp_path)
     assert found["near_ticks"] > 100
     assert found["oracle_pace"] > found["qp_pace"] + 0.05
