@@ -9,6 +9,7 @@ import numpy as np
 
 from hrcreplay.audit.departures import LimbDepartures, tube_stage
 from hrcreplay.pipeline.surroundings import PredictionStage
+from hrcreplay.records import BODY
 from tests.tools.coverage_cost import cost, departed
 
 
@@ -30,7 +31,9 @@ def _held_shares(stage: PredictionStage, sample: LimbDepartures, factor: float) 
     beyond_m, swings_s = (np.ceil(factor * of / 1e-3 - 1e-9) * 1e-3 for of in (known.beyond_m, known.swings_s))
     residuals = np.ceil(factor * known.residuals / 1e-2 - 1e-9) * 1e-2
     scaled = tube_stage(stage, replace(known, beyond_m=beyond_m, residuals=residuals, swings_s=swings_s))
-    thick_m = scaled.predictor.rules.body_m
+    thick_m = np.tile(scaled.predictor.rules.body_m, (len(sample.states), 1))
+    new = np.isnan(sample.states.residual_m[:, BODY.index("THX")])
+    thick_m[new, BODY.index("LEGS")] += stage.settings.residual_unknown_m  # their departures are beside it
     shares = []
     for k, horizon_s in enumerate(known.horizon_s.tolist()):
         departs_m = scaled.volumes(sample.states, horizon_s).radius_m - thick_m
