@@ -52,16 +52,13 @@ class ClockCheck:
 
     def _tracks(self) -> dict[str, SkeletonTrack]:
         """Returns the world track of each camera."""
-        table = CameraFrames.join(self._kept) if self._kept else None
-        if table is None:
-            return {}
-        found = {name: track_of(table, i) for i, name in enumerate(self._cameras)}
-        poses = dict(zip(self._cameras, self._poses, strict=True))
-        return {
-            name: replace(track, points_m=transform(poses[name], track.points_m))
-            for name, track in found.items()
-            if len(track)
-        }
+        found = {}
+        for i, name in enumerate(self._cameras):
+            own = [frames.rows(frames.camera == i) for frames in self._kept]
+            if any(map(len, own)):  # one camera after the other, as the tracks of a long log are large
+                track = track_of(CameraFrames.join(own), i)
+                found[name] = replace(track, points_m=transform(self._poses[i], track.points_m))
+        return found
 
 
 def _disagrees(offset: ClockOffset) -> bool:

@@ -8,7 +8,7 @@ person's volumes and to the recorded body, and what each controller of the run d
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -56,7 +56,7 @@ from hrcreplay.store.stored_table import RunTable, StoredTable, number_columns, 
 _STANDS = 1e-3
 #: Numbers of ticks before the requested one at which the computation starts, if one tick does not reproduce the record.
 _BEFORE = (0, 25, 250)
-#: Ticks whose people are read together.
+#: Ticks whose people, and whose robot, are read together.
 _BATCH = 4096
 
 
@@ -69,19 +69,14 @@ class Record:
     run_config: RunConfig
     log: Log
     motion: RunTable
-    _q: Floats = field(init=False)
-    _dq: Floats = field(init=False)
-    _u: Floats = field(init=False)
 
     def __post_init__(self) -> None:
-        axes = range(1, 1 + sum(name[0] == "u" and name[1:].isdigit() for name in self.motion.columns))
-        self._q, self._dq, self._u = (  # row by row, as everywhere else: kernels are compiled anew for other layouts
-            np.ascontiguousarray(number_columns(self.motion, [f"{name}{i}" for i in axes])) for name in ("q", "dq", "u")
-        )
+        self._axes = range(1, 1 + sum(name[0] == "u" and name[1:].isdigit() for name in self.motion.columns))
         self._status = text_column(self.motion, "status")
         self.states = StoredTable(self.folder / "state.parquet")
         self.ticks_ns, self.first = ticks_of(self.states["t_ns"].to_numpy())
         self._batch: tuple[int, HumanStates] | None = None
+        self._rows: tuple[int, dict[str, Floats]] | None = None
         plan = self.run_config.settings.plan.model_copy(update={"method": self.method, "baselines": ()})
         self.run_config = replace(self.run_config, settings=self.run_config.settings.model_copy(update={"plan": plan}))
 
@@ -125,6 +120,29 @@ class Record:
         states, before = self._batch[1], int(self.first[start])
         return states.rows(slice(int(self.first[tick]) - before, int(self.first[tick + 1]) - before))
 
+    def robot(self, what: str, tick: int) -> Floats:
+        """(axes,) ``q`` [rad], ``dq`` [rad/s] or ``u`` [rad/s^2] as recorded at a tick."""
+        start = tick - tick % _BATCH
+        if self._rows is None or self._rows[0] != start:
+            rows, found = self.motion.iloc[start : start + _BATCH], {}
+            for name in ("q", "dq", "u"):  # row by row, as everywhere else: kernels are compiled anew for other layouts
+                found[name] = np.ascontiguousarray(number_columns(rows, [f"{name}{i}" for i in self._axes]))
+            self._rows = start, found
+        return self._rows[1][what][tick - start]
+
+    @cached_property
+    def frames(self) -> dict[str, tuple[Ints, Ints]]:
+        """Camera -> arrivals of its frames in order, and the newest capture until each [ns]; of none without them."""
+        path = self.folder / "measurements.parquet"
+        if not path.exists():
+            return {}
+        table = pq.read_table(path, columns=["camera", "capture_ns", "arrival_ns"], read_dictionary=["camera"])
+        frames, found = table.to_pandas(), {}
+        for camera, rows in frames.groupby("camera", observed=True):
+            rows = rows.sort_values("arrival_ns", kind="stable")
+            found[str(camera)] = rows["arrival_ns"].to_numpy(), rows["capture_ns"].cummax().to_numpy()
+        return found
+
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of all volumes, in the order of ``MotionRow.limb``."""
@@ -137,7 +155,7 @@ class Record:
             controller = self.controller
             controller.stop, controller.s_s = current_stop, float(self.motion["programme_s"].iloc[first])
             controller.point = controller.reference.sample(controller.s_s)
-            controller.u = self._u[first - 1].copy() if first else np.zeros(controller.robot.nv)
+            controller.u = self.robot("u", first - 1).copy() if first else np.zeros(controller.robot.nv)
             controller.planes = NO_PLANES
             context = None
             for now in range(first, tick + 1):
@@ -162,11 +180,11 @@ class Record:
         """Returns True if a step equals the recorded one bit by bit."""
         row = self.motion.iloc[tick]
         same = STATUSES[step.status] == row["status"] and REASONS[step.reason] == (row["reason"] or "")
-        same = same and np.array_equal(step.u, self._u[tick]) and step.certified == row["certified"]
+        same = same and np.array_equal(step.u, self.robot("u", tick)) and step.certified == row["certified"]
         same = same and np.array_equal(step.distance_m, row["distance_m"], equal_nan=True)
         if tick + 1 < len(self.motion):
-            same = same and np.array_equal(step.next.q, self._q[tick + 1])
-            same = same and np.array_equal(step.next.dq, self._dq[tick + 1])
+            same = same and np.array_equal(step.next.q, self.robot("q", tick + 1))
+            same = same and np.array_equal(step.next.dq, self.robot("dq", tick + 1))
         return bool(same)
 
     def _starts(self, tick: int) -> Iterator[tuple[int, Stop]]:
@@ -177,26 +195,28 @@ class Record:
                 for stop in self._stops(first):
                     yield first, stop
         else:
-            rest = np.flatnonzero((self._dq[: tick + 1] == 0.0).all(axis=1))[::-1]
+            at_rest_there = np.all([self.motion[f"dq{i}"].to_numpy() == 0.0 for i in self._axes], axis=0)
+            rest = np.flatnonzero(at_rest_there[: tick + 1])[::-1]
             programme_s = self.motion["programme_s"].to_numpy(dtype=float)
             for first in rest[[i for i in (0, 25, 250) if i < len(rest)]].tolist():
-                yield first, at_rest(self._q[first], np.array([programme_s[first], 0.0]))
+                yield first, at_rest(self.robot("q", first), np.array([programme_s[first], 0.0]))
         first_s = float(self.motion["programme_s"].iloc[0])
-        yield 0, at_rest(self._q[0], np.array([first_s, 0.0]))
+        yield 0, at_rest(self.robot("q", 0), np.array([first_s, 0.0]))
 
     def _stops(self, tick: int) -> Iterator[Stop]:
         """Returns the stops that may be under way at a tick of ``qp``: the stop after the last step that was taken."""
-        if not self._dq[tick].any():
-            yield at_rest(self._q[tick])
+        q = self.robot("q", tick)
+        if not self.robot("dq", tick).any():
+            yield at_rest(q)
             return
         first = tick
         while first and self._status[first - 1] == "braking":
             first -= 1
         robot, dt_s = self.controller.robot, self.controller.settings.dt_s
         for form in (stop_straight, stop_axis_by_axis):
-            stop = form(self._q[first], self._dq[first], robot.ddq_max, dt_s)
+            stop = form(self.robot("q", first), self.robot("dq", first), robot.ddq_max, dt_s)
             gone = tick - first
-            if gone <= stop.ticks and np.array_equal(stop.q[gone], self._q[tick]):
+            if gone <= stop.ticks and np.array_equal(stop.q[gone], q):
                 yield Stop(stop.q[gone:], stop.dq[gone:], stop.along[gone:])
 
 
@@ -367,18 +387,16 @@ def _objects(record: Record, tick: int) -> dict[str, Any]:
 
 def _cameras(record: Record, tick: int) -> dict[str, dict[str, float | None]]:
     """Camera -> time since its frames last entered the fused person, and the age of its newest frame then [s]."""
-    states, t_ns = record.states, int(record.ticks_ns[tick])
-    path = record.folder / "measurements.parquet"
-    frames = pq.read_table(path, columns=["camera", "capture_ns", "arrival_ns"]).to_pandas() if path.exists() else None
-    found = {}
+    states, t_ns, found = record.states, int(record.ticks_ns[tick]), {}
     for valid in [name for name in states.columns if name.startswith("valid_")]:
-        camera = valid.removeprefix("valid_")
-        used = np.flatnonzero(states[valid].to_numpy(dtype=bool)[: record.first[tick + 1]])
-        newest = None
-        if frames is not None:
-            arrived = frames[(frames["camera"] == camera) & (frames["arrival_ns"] <= t_ns)]
-            newest = None if arrived.empty else (t_ns - int(arrived["capture_ns"].max())) * 1e-9
-        ago = None if not len(used) else (t_ns - int(states["t_ns"].to_numpy()[used[-1]])) * 1e-9
+        camera, newest, ago = valid.removeprefix("valid_"), None, None
+        if camera in record.frames:
+            arrival_ns, newest_ns = record.frames[camera]
+            arrived = int(np.searchsorted(arrival_ns, t_ns, side="right"))
+            newest = (t_ns - int(newest_ns[arrived - 1])) * 1e-9 if arrived else None
+        used = states[valid].to_numpy(dtype=bool)[: record.first[tick + 1]][::-1]
+        if used.any():
+            ago = (t_ns - int(states["t_ns"].to_numpy()[len(used) - 1 - int(used.argmax())])) * 1e-9
         found[camera] = {"used_s_ago": ago, "newest_frame_s_ago": newest}
     return found
 

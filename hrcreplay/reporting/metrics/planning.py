@@ -8,7 +8,7 @@ time at the foot point is the progress of the robot.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,7 @@ import pandas as pd
 
 from hrcreplay.geometry.polyline import advance_foot
 from hrcreplay.records import RECORDED, STATUSES, Bools, Floats, Ints
-from hrcreplay.reporting.metrics.series import MetricTable, durations_s, path_feet, times
+from hrcreplay.reporting.metrics.series import MetricTable, durations_s, path_feet, step_lengths, times, way_along
 from hrcreplay.robot.recorded import UNKNOWN
 from hrcreplay.store.stored_table import RunTable, number_columns, text_column
 
@@ -41,13 +41,11 @@ class Programme:
 
 def programme(ref_m: Floats, programme_s: Floats) -> Programme:
     """Makes the path from references (n, 3) [m] at programmed times (n,) [s]; at least one row, all finite."""
-    steps = np.linalg.norm(np.diff(ref_m, axis=0), axis=1)
-    moved = np.concatenate([[True], steps > _ROUNDING_M])
+    moved = np.concatenate([[True], step_lengths(ref_m) > _ROUNDING_M])
     first = np.flatnonzero(moved)
     last = np.append(first[1:], len(ref_m)) - 1
     points = ref_m[first]
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    return Programme(points, way, programme_s[first], programme_s[last], np.cumsum(moved) - 1)
+    return Programme(points, way_along(points), programme_s[first], programme_s[last], np.cumsum(moved) - 1)
 
 
 def foot(path: Programme, tcp_m: Floats, ahead_m: float) -> tuple[int, float]:
@@ -86,18 +84,22 @@ def programme_progress(motion: RunTable, ahead_m: float) -> tuple[float, float] 
         motion: A table of motion.
         ahead_m: As for ``foot``: plan.max_reference_lead_m [m].
     """
-    names = ["programme_s", *(f"{what}_{axis}" for what in ("ref", "tcp") for axis in "xyz")]
-    rows, t_ns = number_columns(motion, names), times(motion)
-    known = np.isfinite(rows).all(axis=1)
-    rows = rows if known.all() else rows[known]
-    if len(rows) < 2:
+    (programmed, tcp), t_ns = ([f"{what}_{axis}" for axis in "xyz"] for what in ("ref", "tcp")), times(motion)
+    known = np.all([np.isfinite(numeric_column(motion, name)) for name in ("programme_s", *programmed, *tcp)], axis=0)
+    if known.sum() < 2:
         return None
-    given_s = float(t_ns[-1] - t_ns[0]) * 1e-9
-    path = programme(rows[:, 1:4], rows[:, 0])
-    waited_s = given_s - (rows[-1, 0] - rows[0, 0])
+    given_s, programme_s = float(t_ns[-1] - t_ns[0]) * 1e-9, numeric_column(motion, "programme_s")[known]
+    path = programme(_known_rows(motion, programmed, known), programme_s)
+    waited_s = given_s - (programme_s[-1] - programme_s[0])
     if len(path.way_m) == 1 and waited_s < 1e-6:
         return None
-    return min(reached_s(path, *foot(path, rows[:, 4:], ahead_m)), given_s), given_s
+    return min(reached_s(path, *foot(path, _known_rows(motion, tcp, known), ahead_m)), given_s), given_s
+
+
+def _known_rows(motion: RunTable, names: Sequence[str], known: Bools) -> Floats:
+    """Returns columns of the rows (n,) that are known; without a copy if all are."""
+    rows = number_columns(motion, names)
+    return rows if known.all() else rows[known]
 
 
 #: Figures that the paper prints for its own experiments; its logs were never published.
@@ -427,7 +429,7 @@ def _add_progress(metrics: MetricTable, prefix: str, motion: RunTable, what: str
         mean = float(known.mean()) if len(known) else None
         metrics.add(f"{prefix}_{name}_mean_m_per_s", mean, "m/s", f"mean over all ticks of {what}: {meaning}")
     for name, what_moved in (("tcp", "TCP"), ("ref", "reference")):
-        steps = np.linalg.norm(np.diff(position_columns(motion, name), axis=0), axis=1)
+        steps = step_lengths(position_columns(motion, name))
         metrics.add(
             f"{prefix}_{name}_travelled_m",
             float(np.nansum(steps)),

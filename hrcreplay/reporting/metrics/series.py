@@ -156,13 +156,29 @@ def envelope(x: Floats, y: Floats, bins: int = 700) -> tuple[Floats, Floats]:
     return x[kept], y[kept]
 
 
+def step_lengths(points: Floats) -> Floats:
+    """Returns (n - 1,) the lengths of the steps between (n, d) points; of a long run in little more memory."""
+    squares = np.zeros(max(0, len(points) - 1))
+    for coordinate in points.T:
+        squares += np.diff(coordinate) ** 2
+    return np.sqrt(squares, out=squares)
+
+
+def way_along(points: Floats) -> Floats:
+    """Returns (n,) the way along a path from its first point to each of (n, d) points."""
+    way = np.zeros(len(points))
+    np.cumsum(step_lengths(points), out=way[1:])
+    return way
+
+
 def thin_path(points: Floats, tolerance: float) -> Floats:
     """Returns (m, d) a path with fewer of its (n, d) points: one per motion of ``tolerance``, and the last."""
     if len(points) < 3:
         return points
-    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    _, first = np.unique(np.floor(travelled / tolerance), return_index=True)
-    return points[np.union1d(first, [len(points) - 1])]
+    motion = np.floor(way_along(points) / tolerance)
+    kept = np.diff(motion, prepend=-1.0) > 0.0
+    kept[-1] = True
+    return points[kept]
 
 
 def thin_stretches(points: Floats, tolerance: float) -> list[Floats]:
