@@ -48,8 +48,11 @@ _MOST = 1.4
 #: Least and maximum factor for people who were not in the fit, and the step in which it is found.
 _LEAST_OTHERS, _MOST_OTHERS, _STEP = 1.02, 1.5, 0.01
 #: Factors on the requested share of misses: for a log that was left out; in the fit, for each log, for each log with
-#: ground truth, and for all logs together; and for people outside the fit, who choose how far lines are widened.
-EACH, _FITTED, _TRUE, _TOGETHER, _OTHERS = 3.0, 2.25, 0.3, 1.2, 0.8
+#: ground truth, and for all logs together.
+EACH, _FITTED, _TRUE, _TOGETHER = 3.0, 2.25, 0.3, 1.2
+#: The same for people outside the fit, who choose how far lines are widened: a margin up to a horizon within which
+#: robots beside people have stopped [s]; none beyond it, where volumes are largest.
+_OTHERS, _OTHERS_LATER, _SOON_S = 0.8, 1.0, 0.25
 #: Departures, their slopes, and rise and sink are rounded up to multiples of these [m], [1], [m]. With steps this
 #: coarse most folds have the same rise and sink, so that departures are measured only once.
 _MM, _HUNDREDTH, _CM = 1e-3, 1e-2, 1e-2
@@ -119,7 +122,8 @@ def others_need(samples: Sequence[LimbDepartures], folds: Sequence[Departure], s
     for k in range(len(found)):
         needed = np.concatenate([_of_pairs([one.factors(fold, k)]).max(axis=1) for one, fold in pooled])
         if len(needed):
-            found[k] = np.quantile(needed, 1.0 - _OTHERS * (1.0 - share), method="higher")
+            missed = _OTHERS if folds[0].horizon_s[k] <= _SOON_S else _OTHERS_LATER
+            found[k] = np.quantile(needed, 1.0 - missed * (1.0 - share), method="higher")
     return np.clip(_up(found, _STEP), _LEAST_OTHERS, _MOST_OTHERS)
 
 
@@ -239,9 +243,9 @@ def _recorded(of_limbs: Floats) -> Bools:
 
 
 def _radii_m(samples: Sequence[LimbDepartures], departure: Departure, k: int) -> Floats:
-    """(pairs,) mean heights of the lines of each pair's first limb; a tube's cost grows with the square [m]."""
+    """(pairs,) mean heights of the lines of each pair; a tube's cost grows with the square [m]."""
     mean = np.concatenate([sample.lines_m(departure, k) for sample in samples]).mean(axis=0)
-    return np.array([mean[pair[0]] for pair in _PAIRS])
+    return np.array([mean[list(pair)].mean() for pair in _PAIRS])
 
 
 def _up(values: Floats, step: float) -> Floats:

@@ -168,7 +168,7 @@ def _find_recorded(sample: LimbDepartures) -> Bools:
 
 
 #: Number of ticks of a log whose volumes are estimated, and number of points for each.
-_COUNTED, _POINTS = 24, 1024
+_COUNTED, _POINTS = 100, 1024
 
 
 def union_m3(stage: PredictionStage, sample: LimbDepartures, departure: Departure, *, legs: bool = True) -> list[float]:
@@ -196,7 +196,9 @@ def capsules_m3(stage: PredictionStage, sample: LimbDepartures) -> list[float]:
 
 
 def _some(states: HumanStates) -> HumanStates:
-    return states.rows(np.unique(np.linspace(0, len(states) - 1, min(_COUNTED, len(states))).astype(np.int64)))
+    """The ticks in the middle of equal parts; at the first one, cameras have shown the person once."""
+    count = min(_COUNTED, len(states))
+    return states.rows(((np.arange(count) + 0.5) * (len(states) / max(1, count))).astype(np.int64))
 
 
 def _union_m3(volumes: SweptVolumes) -> float:

@@ -1,12 +1,13 @@
-"""How large the volumes are of people of whom only the arms are seen, and how often they hold them.
+"""How large the volumes are of people who are partly out of sight, and how often they hold them.
 
     python -m tests.tools.partly_seen [--json] [NAME...]
 
-All points of a recording but elbows and wrists go out of sight for the second half of every three seconds. Against what
-was recorded without that, shortly after it and once the filter has forgotten the torso: the share of ticks in which
-every recorded limb stayed whole in its volume until the braking time, and the mean volume of the union beside that of
-the same ticks with everything in sight. And the last volume that there would be, were the points that are seen
-known to go no further than limbs of people seen whole depart: at ``SLOWLY`` of people's speeds.
+All points of a recording but elbows and wrists, or a wrist with its hand, go out of sight for the second half of every
+three seconds. Against what was recorded without that, shortly after it and once the filter has forgotten the torso, or
+the forearm: the share of ticks in which every recorded limb stayed whole in its volume until the braking time, and the
+mean volume of the union beside that of the same ticks with everything in sight. And, of arms alone, the last volume
+that there would be, were the points that are seen known to go no further than limbs of people seen whole depart: at
+``SLOWLY`` of people's speeds.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from unittest import mock
@@ -35,19 +37,24 @@ from hrcreplay.records import BODY, POINTS, HumanStates, Ints
 from tests.tools import bases
 from tests.tools.readme.measurements import PARTLY_SEEN_OF, SLOWLY
 
-SHOWN = tuple(f"{point}_{side}" for point in ("elbow", "wrist") for side in "rl")
+_ARMS = [f"{point}_{side}" for point in ("elbow", "wrist") for side in "rl"]
+_FOREARM = ["wrist_r", "hand_r"]
+#: What is left of a person -> the points that go out of sight, and the limb that the filter forgets with them.
+CASES = {
+    "arms": (tuple(name for name in POINTS if name not in _ARMS), "THX"),
+    "all but a forearm": (tuple(_FOREARM), "LRA"),
+}
 _EVERY_S, _HIDDEN_S, _SECONDS = 3.0, 1.5, 20.0
-#: How long the torso has been out of sight: at least this long [s]; then until the filter forgets it, and longer.
+#: How long that limb has been out of sight: at least this long [s]; then until the filter forgets it, and longer.
 FRESH_S = 0.1
 WHEN, WHAT = ("just", "long"), ("partly", "whole")
 #: Every so many ticks one is looked at.
 _STEP = 6
-_THORAX = BODY.index("THX")
 
 
-def hide(log: Log, path: Path) -> Path:
-    """Writes the log with the points out of sight in the last part of every period."""
-    hidden = [k for k, name in enumerate(POINTS) if name not in SHOWN]
+def hide(log: Log, path: Path, points_hidden: Sequence[str]) -> Path:
+    """Writes the log with some of POINTS out of sight in the last part of every period."""
+    hidden = [POINTS.index(name) for name in points_hidden]
     with LogWriter(path) as writer:
         for name in log.header.cameras:
             writer.camera(name, log.header.T_world_camera.get(name, np.eye(4)))
@@ -75,11 +82,28 @@ def measure(name: str, tmp: Path) -> dict[str, float]:
     stage, settings = assembly.prediction_stage(run_config), run_config.settings
     log = open_log(run_config.log, settings.logs)
     ticks_ns = tick_times(*span_ns(run_config, log), settings.fusion.rate_hz)
+    found: dict[str, float] = {}
     whole = read(log, run_config, ticks_ns)
-    partly = read(open_log(hide(log, tmp / "hidden.mcap"), settings.logs), run_config, ticks_ns).states
-    unseen_s, in_sight = partly.unseen_s[:, _THORAX], whole.states.unseen_s[:, _THORAX] < FRESH_S
+    for case, (hidden, limb) in CASES.items():
+        partly_log = open_log(hide(log, tmp / f"{case}.mcap", hidden), settings.logs)
+        partly = read(partly_log, run_config, ticks_ns).states
+        compared = compare(stage, whole, partly, BODY.index(limb))
+        found |= {f"{case} {key}": value for key, value in compared.items()}
+    return found
+
+
+def compare(stage: PredictionStage, whole: Recording, partly: HumanStates, limb: int) -> dict[str, float]:
+    """Volumes of somebody partly out of sight beside those of everything in sight, and how often they hold.
+
+    Args:
+        stage: Of the volumes.
+        whole: The recording.
+        partly: The same person with points hidden.
+        limb: Index into BODY: the ticks are those in which this one is out of sight.
+    """
+    unseen_s, in_sight = partly.unseen_s[:, limb], whole.states.unseen_s[:, limb] < FRESH_S
     compared = in_sight & np.isfinite(whole.states.p[:, 0])
-    compared &= ticks_ns + round(stage.horizon_s * 1e9) <= whole.t_ns[-1]
+    compared &= whole.states.t_ns + round(stage.horizon_s * 1e9) <= whole.t_ns[-1]
     found: dict[str, float] = {}
     for when, least_s, most_s in ((WHEN[0], FRESH_S, stage.memory_s), (WHEN[1], stage.memory_s, np.inf)):
         ticks = np.flatnonzero(compared & (unseen_s > least_s) & (unseen_s <= most_s))[::_STEP]
@@ -104,12 +128,18 @@ def judge(stage: PredictionStage, whole: Recording, states: HumanStates) -> tupl
 
 
 def told(name: str, found: dict[str, float]) -> str:
-    """The line of one recording."""
-    each = [
-        f"{when}: " + ", ".join(f"{w} {found[f'{when}_{w}_held']:.1%}, {found[f'{when}_{w}_m3']:.1f} m3" for w in WHAT)
-        for when in WHEN
-    ]
-    return f"{name} | {' | '.join(each)} | slow: {found[f'{WHEN[1]}_slow_m3']:.1f} m3"
+    """The lines of one recording."""
+    lines = []
+    for case in CASES:
+        each = [
+            f"{when}: "
+            + ", ".join(
+                f"{w} {found[f'{case} {when}_{w}_held']:.1%}, {found[f'{case} {when}_{w}_m3']:.1f} m3" for w in WHAT
+            )
+            for when in WHEN
+        ]
+        lines.append(f"{name}, {case} | {' | '.join(each)} | slow: {found[f'{case} {WHEN[1]}_slow_m3']:.1f} m3")
+    return "\n".join(lines)
 
 
 def parser() -> argparse.ArgumentParser:

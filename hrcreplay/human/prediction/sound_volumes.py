@@ -1,8 +1,9 @@
 """Swept volumes that enclose every motion of Eq. (25) within the limits, from every likely state: the method ``sound``.
 
 If the limit set bounds the departure of limbs from constant velocity, a recently seen limb has the tube of
-``velocity_tube``. Every other limb is enclosed joint by joint. Proof that no motion with the stops of Eq. (34) leaves
-this volume, at any time and from any likely state:
+``velocity_tube``. Every other limb is enclosed joint by joint, or in the tube of the limb on which it hangs widened by
+its own length, if that is smaller: wherever that limb is, this one starts there. Proof that no motion with the stops of
+Eq. (34) leaves the volume of the joints, at any time and from any likely state:
 
 1. States. Each joint's position and velocity are within ``sigmas`` standard deviations of the estimate, for any
    correlation: a box around it. World velocities are turned into the body's frame over all headings of the box.
@@ -88,6 +89,9 @@ FINE_RAD = np.pi / 6.0
 MOST_CORNERS = 256
 #: Size above which a set is reduced before the next rotation.
 _MANY_CORNERS = 40
+
+#: For each of LIMBS the one on which it hangs, and the index of its length in LENGTHS; the thorax hangs on none.
+_HANGS_ON, _LENGTH_OF = np.array([THORAX, THORAX, THORAX, URA, THORAX, ULA]), np.array([1, 0, 4, 6, 3, 5])
 
 
 class SoundRules(NamedTuple):
@@ -245,6 +249,9 @@ def sweep_sound(
                 else:
                     ends = rows.lengths[i], rows.lengths_off[i]
                     swept, count = _limb(limb, low, high, corners, *ends, rules.hand_m, work)
+                    many, radius = _hanging(i, limb, rows, span_s[i - first], rules, short)
+                    if _box_m3(short, many, radius) < _box_m3(swept, count, radii[i - first, limb]):
+                        swept, count, radii[i - first, limb] = short, many, radius
                 vertices = append(vertices, n, swept, count)
             n += count
             offsets[(i - first) * limbs + limb + 1] = n
@@ -275,6 +282,40 @@ def _tube(i: int, limb: int, rows: SoundRows, span_s: float, rules: SoundRules, 
     if lost > 0.0:  # the filter brings an unseen torso to rest, but people walk on
         departs = max(departs, departs_m(limb, span_s, residual, speed, rules.departure) + lost)
     return count, thick + departs
+
+
+@njit(cache=True, inner=True)
+def _hanging(i: int, limb: int, rows: SoundRows, span_s: float, rules: SoundRules, swept: Floats) -> tuple[int, float]:
+    """Writes the tube of the limb on which one out of sight hangs: it is within its length of there.
+
+    Returns:
+        Number of points, 0 if no limb up the chain has a tube, and the radius, which includes the limb's own [m].
+    """
+    length, by = rows.tubed.residual[i, limb], limb
+    while by != THORAX and not rows.tubed.usable[i, by]:
+        k = _LENGTH_OF[by]
+        length += rows.lengths[i, k] + rows.lengths_off[i, k]
+        by = _HANGS_ON[by]
+    if not rows.tubed.usable[i, by]:
+        return 0, np.nan
+    if (limb - 2) % 2 == 1:
+        length += rules.hand_m
+    count, radius = _tube(i, by, rows, span_s, rules, swept)
+    return count, radius - rules.body_m[by] + rules.body_m[limb] + length
+
+
+@njit(cache=True, inner=True)
+def _box_m3(points: Floats, count: int, radius: float) -> float:
+    """Volume of the box around the first points with a ball; inf if there are none, or they are not known [m^3]."""
+    if count == 0:
+        return np.inf
+    size = 1.0
+    for axis in range(3):
+        low, high = points[0, axis], points[0, axis]
+        for k in range(1, count):
+            low, high = min(low, points[k, axis]), max(high, points[k, axis])
+        size *= high - low + 2.0 * radius
+    return size if np.isfinite(size) else np.inf
 
 
 @njit(cache=True, inner=True)

@@ -38,7 +38,7 @@ _STRIDE = 2.0
 _LEGS_AGE_S = 0.07
 #: Sway of legs, ``HumanStates.legs_sway_m``, that counts at least; that counts at most, as of people who walk, whose
 #: legs a tracker throws, or whose sway is not known; and of legs out of sight, as of somebody on one spot [m].
-_LEAST_SWAY_M, _MOST_SWAY_M, _HIDDEN_SWAY_M = 0.008, 0.03, 0.022
+_LEAST_SWAY_M, _MOST_SWAY_M, _HIDDEN_SWAY_M = 0.008, 0.03, 0.018
 #: Maximum rise, and sink, of an arm's hull [m].
 _ARMS_RISE_M = 0.06
 #: Minimum distance of a hand from its wrist that gives a direction [m].

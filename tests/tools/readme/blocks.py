@@ -113,9 +113,10 @@ def headline(facts: Facts) -> str:
 
 
 _ENCLOSES = {
-    "sound": "everybody whose limbs keep to the bounds on departures; of a limb out of sight, or under limits without "
-    "such bounds, every motion of the model from every state within `prediction.sigmas` of the estimate; over the "
-    "braking time and the latency, with a hand, a lower body, and the measured distance of the body from the model",
+    "sound": "everybody whose limbs keep to the bounds on departures; of a limb out of sight, all within its length of "
+    "the one that carries it, or every motion of the model from every state within `prediction.sigmas` of the "
+    "estimate, whichever is less; under limits without such bounds the latter; over the braking time and the latency, "
+    "with a hand, a lower body, and the measured distance of the body from the model",
     "paper": "Eq. (20)-(30), Alg. 1 and 2 as printed, corrected only where the printed equations cannot be computed",
     "positions": "only bounds of positions and velocities, as printed",
 }
@@ -223,11 +224,25 @@ def partly_seen(facts: Facts) -> str:
     """Whole people inside and volumes, where only the arms are seen and where everything is."""
     of, rows = _of(facts, "partly seen"), []
     for name in PARTLY_SEEN_OF:
-        each = [f"{name} {when}_{what}" for when in ("just", "long") for what in ("partly", "whole")]
-        cells = [f"{_share(of[f'{one}_held'])}, {_m3(of[f'{one}_m3'])} ({of[f'{one}_median_m3']:.1f})" for one in each]
-        rows.append([name, *cells, _m3(of[f"{name} long_slow_m3"])])
+        each = [f"{name} arms {when}_{what}" for when in ("just", "long") for what in ("partly", "whole")]
+        rows.append([name, *_held_in(of, each), _m3(of[f"{name} arms long_slow_m3"])])
     heads = [f"{when}, {what}" for when in ("0.1 to 0.5 s", "longer") for what in ("arms alone", "everything in sight")]
     return _table(["recording", *heads, f"longer, arms alone, at {SLOWLY:g} of the speeds"], rows)
+
+
+def without_a_forearm(facts: Facts) -> str:
+    """The same, where a forearm is out of sight."""
+    of, rows, whats = _of(facts, "partly seen"), [], ("partly", "whole")
+    for name in PARTLY_SEEN_OF:
+        each = [f"{name} all but a forearm {when}_{what}" for when in ("just", "long") for what in whats]
+        rows.append([name, *_held_in(of, each)])
+    heads = ("all but a forearm", "everything in sight")
+    return _table(["recording", *(f"{when}, {what}" for when in ("0.1 to 0.5 s", "longer") for what in heads)], rows)
+
+
+def _held_in(of: Mapping[str, Any], each: Sequence[str]) -> list[str]:
+    """Shares held, with the mean volume and its median."""
+    return [f"{_share(of[f'{one}_held'])}, {_m3(of[f'{one}_m3'])} ({of[f'{one}_median_m3']:.1f})" for one in each]
 
 
 def coverage_cost(facts: Facts) -> str:
@@ -298,6 +313,7 @@ BLOCKS: dict[str, Callable[[Facts], str]] = {
     "misses": misses,
     "oracle": oracle,
     "partly_seen": partly_seen,
+    "without_a_forearm": without_a_forearm,
     "coverage_cost": coverage_cost,
     "margins": margins,
 }

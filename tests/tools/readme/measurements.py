@@ -157,7 +157,7 @@ def of_oracle(found: Mapping[str, Any]) -> Figures:
 
 
 def of_partly_seen(found: Mapping[str, Any]) -> Figures:
-    """What is kept of people of whom only the arms are seen, recording by recording."""
+    """What is kept of people who are partly out of sight, recording by recording."""
     return {f"{name} {key}": value for name in PARTLY_SEEN_OF for key, value in found[name].items()}
 
 

@@ -129,8 +129,9 @@ def _oracled(numbers: Any) -> dict[str, Any]:
 
 
 def _partly_seen(numbers: Any) -> dict[str, Any]:
-    each = [f"{when}_{what}" for when in ("just", "long") for what in ("partly", "whole")]
-    keys = [*(f"{one}_{what}" for one in each for what in ("held", "m3", "median_m3")), "long_slow_m3"]
+    cases = [f"{case} {when}" for case in partly_seen.CASES for when in partly_seen.WHEN]
+    each = [f"{case}_{what}" for case in cases for what in partly_seen.WHAT]
+    keys = [*(f"{one}_{what}" for one in each for what in ("held", "m3", "median_m3")), "arms long_slow_m3"]
     return {name: {key: next(numbers) for key in keys} for name in PARTLY_SEEN_OF}
 
 
