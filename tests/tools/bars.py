@@ -89,6 +89,15 @@ def table(bare: dict[str, Any], live: dict[str, Any]) -> Iterator[str]:
     yield f"{'overruns of the double':24}{bare['overruns']:>12}{live['overruns']:>12}"
 
 
+def stolen_s() -> float:
+    """CPU time that the host of a virtual machine has given to others since its start, in all cores; NaN: not known."""
+    try:
+        counts = Path("/proc/stat").read_text().splitlines()[0].split()
+    except OSError:
+        return math.nan
+    return int(counts[8]) / os.sysconf("SC_CLK_TCK")  # user, nice, system, idle, iowait, irq, softirq, steal
+
+
 def pauses_ns(folder: Path) -> Ints:
     """When a pause between two answers began, on the clock that all doubles share."""
     t_ns = pd.read_csv(folder / "twin_arrivals.csv", usecols=["t_ns"])["t_ns"].to_numpy()
@@ -139,9 +148,12 @@ def main() -> int:
     if given.people > 1 or given.seconds > RECORDED_S:
         people = crowd.there_and_back(*crowd.people(given.people, math.inf), given.seconds + 30.0)
         human = crowd.write(out / "people.mcap", crowd.record(*people))
+    before_s = stolen_s()
     bare, live, session = measure(out, given.seconds, human, faults=given.faults)
+    stolen_ms = 1e3 * (stolen_s() - before_s)
     verified, found = verdict(session.folder), stops(session.folder)
     sys.stdout.write("\n".join([*table(bare, live), *paused(out)]) + "\n")
+    sys.stdout.write(f"the host took {stolen_ms:.0f} ms of CPU time for others\n")
     sys.stdout.write(f"stops of the session: {', '.join(found) or 'none'}\n")
     sys.stdout.write(f"the robot moved in {moving(session.folder):.0%} of the ticks\n")
     sys.stdout.write(f"sessions of the double: {live['sessions']}\nverify: {verified}\nall of it: {out}\n")
