@@ -12,19 +12,25 @@ from hrcreplay.settings.sections import Fusion
 
 
 class PeopleSmoother:
-    """Smooths each person of a run; rows of one person are in order of time."""
+    """Smooths each person of a run; rows of one person are in order of time.
+
+    Nobody who is forgotten comes back under the same number, so that the memory is that of the people who are there.
+    """
 
     def __init__(self, settings: Fusion) -> None:
         self._settings = settings
         self._each: dict[int, StretchSmoother] = {}
 
     def add(self, states: HumanStates, trace: fuse.Trace) -> list[HumanStates]:
-        """Adds the next ticks; returns the stretches that they complete, smoothed."""
+        """Adds the next ticks; returns the stretches that they complete, smoothed, and people who are gone."""
         found = []
         for number in sorted(set(states.numbers.tolist())):
             mine = np.flatnonzero(states.numbers == number)
             one = self._each.setdefault(number, StretchSmoother(self._settings))
             found += _numbered(one.add(states.of_person(number), trace.rows(mine)), number)
+        there = set(states.numbers[states.t_ns == states.t_ns[-1:]].tolist()) or self._each.keys()
+        for number in sorted(self._each.keys() - there):
+            found += _numbered(self._each.pop(number).finish(), number)
         return found
 
     def finish(self) -> list[HumanStates]:

@@ -89,17 +89,17 @@ class TableWriter:
             self._waiting = [table.slice(whole)]
 
     def _widen(self, names: Sequence[str]) -> None:
-        """Writes all rows so far again, with the optional columns among ``names``."""
-        before = self._waiting
-        if self._writer is not None:
-            self._writer.close()
-            self._writer = None
-            before = [pq.read_table(self._path), *before]
-        self._waiting = [fill_optional(pa.concat_tables(before), names)]
-        while len(self._waiting[0]) >= self.ROWS:
-            whole = self._waiting[0]
-            self._flush(whole.slice(0, self.ROWS))
-            self._waiting = [whole.slice(self.ROWS)]
+        """Writes all rows so far again, with the optional columns among ``names``, one group of rows at a time."""
+        self._waiting = [fill_optional(table, names) for table in self._waiting]
+        if self._writer is None:
+            return
+        self._writer.close()
+        self._writer, narrow = None, self._path.with_suffix(".narrow")
+        self._path.rename(narrow)
+        with pq.ParquetFile(narrow) as before:
+            for group in range(before.num_row_groups):
+                self._flush(fill_optional(before.read_row_group(group), names))
+        narrow.unlink()
 
     def _flush(self, table: pa.Table) -> None:
         if self._writer is None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from hrcreplay.human.fusion.inverse_kinematics import measure
 from hrcreplay.human.fusion.smoother import smooth
 from hrcreplay.human.model import skeleton
 from hrcreplay.limits import load_limits
-from hrcreplay.pipeline.people_smoother import StretchSmoother
+from hrcreplay.pipeline.people_smoother import PeopleSmoother, StretchSmoother
 from hrcreplay.pipeline.stages import write_smoothed
 from hrcreplay.records import Growing, HumanStates
 from hrcreplay.settings.sections import Fusion
@@ -83,6 +83,31 @@ def test_what_waits_for_the_next_stretch_does_not_keep_the_whole_one(
     for array in kept.values():
         assert array.base is None
         assert len(array) == LATER
+
+
+@pytest.mark.parametrize("size", [10, 45])
+def test_who_is_gone_is_smoothed_and_forgotten(run: tuple[HumanStates, Trace], size: int) -> None:
+    """A visitor, at 60 of the ticks, comes out when gone: an hour's visitors would fill the memory."""
+    states, trace = run
+    visit = np.arange(20, 80)
+    person = np.concatenate([np.ones(N, np.int64), np.full(len(visit), 2)])
+    which = np.concatenate([np.arange(N), visit])
+    order = np.lexsort((person, states.t_ns[which]))
+    both = replace(states.rows(which[order]), person=person[order])
+    traces, tick = trace.rows(which[order]), np.searchsorted(states.t_ns, both.t_ns)
+    people, found = PeopleSmoother(SETTINGS), {}
+    for first in range(0, N, size):
+        rows = np.flatnonzero((tick >= first) & (tick < first + size))
+        for part in people.add(both.rows(rows), traces.rows(rows)):
+            found[first] = part
+        assert sorted(people._each) == ([1, 2] if 20 <= min(first + size, N) - 1 < 80 else [1])
+    ((first, visitor),) = found.items()
+    assert first <= 80 < first + size + 1
+    alone = smooth(states.rows(visit), trace.rows(visit), SETTINGS)
+    np.testing.assert_array_equal(visitor.p, alone.p)
+    assert set(visitor.numbers.tolist()) == {2}
+    (last,) = people.finish()
+    np.testing.assert_array_equal(last.p, smooth(states, trace, SETTINGS).p)
 
 
 def test_smoothed_people_are_written_some_rows_at_a_time(

@@ -6,6 +6,7 @@ import subprocess
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
@@ -134,3 +135,29 @@ def test_a_column_that_comes_late_gives_the_bytes_of_a_table_that_always_had_it(
     late = write(tmp_path / "late.parquet", 250, always=False)
     assert late == write(tmp_path / "whole.parquet", 777, always=True)
     assert pq.read_table(tmp_path / "late.parquet")["person"].to_pylist() == person.tolist()
+
+
+def test_a_column_that_comes_late_is_added_one_group_of_rows_at_a_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A whole table of an hour takes several gigabytes."""
+    monkeypatch.setattr(TableWriter, "ROWS", 8)
+    most, read = [0], pq.ParquetFile.read_row_group
+
+    def counted(file: pq.ParquetFile, group: int) -> pa.Table:
+        found = read(file, group)
+        most[0] = max(most[0], len(found))
+        return found
+
+    monkeypatch.setattr(pq.ParquetFile, "read_row_group", counted)
+    monkeypatch.setattr(pq, "read_table", lambda *_: pytest.fail("the whole table was read"))
+    table = TableWriter(tmp_path / "late.parquet")
+    for first in range(0, 100, 4):
+        t_ns = np.arange(first, first + 4)
+        table.write({"t_ns": t_ns} | ({"person": np.full(4, 2)} if first >= 90 else {}))
+    table.close()
+    assert most == [8]
+    assert [path.name for path in tmp_path.iterdir()] == ["late.parquet"]
+    with pq.ParquetFile(tmp_path / "late.parquet") as file:
+        assert file.metadata.num_rows == 100
+        assert file.read()["person"].to_pylist() == [1] * 92 + [2] * 8
