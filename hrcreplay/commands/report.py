@@ -27,7 +27,7 @@ from hrcreplay.reporting.figures.catalogue import FigureData, FigureKind
 from hrcreplay.reporting.figures.figure_data import compute_fields
 from hrcreplay.reporting.metrics.contact import add_contact
 from hrcreplay.reporting.metrics.fusion import add_fusion, add_limbs, add_occupancy, add_quality
-from hrcreplay.reporting.metrics.people import add_people
+from hrcreplay.reporting.metrics.people import add_people, most_tracked
 from hrcreplay.reporting.metrics.planning import add_plan
 from hrcreplay.reporting.metrics.series import Metric, MetricTable, start_ns
 from hrcreplay.reporting.movie import default_name, write_movie
@@ -47,6 +47,8 @@ from hrcreplay.store.run_folder import Run, RunWriter
 
 #: Key of ``--figure`` for all figures for which a run has the data.
 ALL_FIGURES = "all"
+#: Maximum number of people who have figures of their own; an hour has many visitors.
+_DRAWN = 6
 
 
 def write_report(
@@ -89,7 +91,8 @@ def write_report(
     here = None if there is not None else writer.partial / "scene.mcap"
     replay = _make_replay(run_config, everybody, here)
     release_freed_memory()
-    _draw_figures(run_config, everybody, found, kinds, folder, progress=progress, second=there)
+    people = most_tracked(everybody, _DRAWN)
+    _draw_figures(run_config, everybody, found, kinds, folder, people=people, progress=progress, second=there)
     progress.begin("page")
     shown = [
         tables.limit_table(run_config.prediction_limits, use="prediction"),
@@ -98,7 +101,7 @@ def write_report(
     ]
     writer.text(
         "report.html",
-        report_page.render(run, found, folder, shown, stops=stops, replay=replay, people=everybody.people),
+        report_page.render(run, found, folder, shown, stops=stops, replay=replay, people=people),
     )
     if there is not None:
         there[1].result()
@@ -146,6 +149,7 @@ def _draw_figures(
     kinds: Sequence[FigureKind],
     folder: Path,
     *,
+    people: Sequence[int] | None = None,
     pdf: bool = False,
     progress: Progress = NO_PROGRESS,
     second: tuple[Executor, Future[Any]] | None = None,
@@ -158,6 +162,7 @@ def _draw_figures(
         metrics: The run's metrics.
         kinds: The figures.
         folder: Folder for the files.
+        people: Those of whom figures are drawn; None: all.
         pdf: True: also as PDF.
         progress: Receives the progress.
         second: A second process and what it does before it draws the last ones; None: no such process.
@@ -166,7 +171,7 @@ def _draw_figures(
         The names drawn.
     """
     drawings = []
-    for number in everybody.people:
+    for number in people or everybody.people:
         shown = [kind for kind in kinds if number == everybody.people[0] or kind.each]
         drawings += [_Drawing(run_config, folder, kind.name, number, pdf) for kind in shown]
     progress.begin("figures", len(drawings))

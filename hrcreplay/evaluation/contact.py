@@ -33,7 +33,8 @@ from hrcreplay.store.run_folder import arrow_table
 from hrcreplay.store.stored_table import RunTable, StoredTable, text_column
 
 _BATCH = 4096
-#: Ticks whose rows are made and written together: a long run's motions would fill the memory.
+#: Ticks whose rows are made and written together, fewer where many people need columns: a long run's motions would fill
+#: the memory.
 STRETCH = 16 * _BATCH
 
 #: Part of the body -> limb whose volume must contain it.
@@ -116,8 +117,9 @@ class JudgedMotion:
     def rows(self) -> Iterator[Columns]:
         """Computes the rows of contact.parquet, one stretch of ticks after the other."""
         decisions = None if self.method in (*UNGUARDED, *ALLOWING_CONTACT) else Decisions.of(self.motion)
-        for first in range(0, len(self.motion), STRETCH):
-            rows = slice(first, first + STRETCH)
+        stretch = max(_BATCH, STRETCH // len(self.people.people))
+        for first in range(0, len(self.motion), stretch):
+            rows = slice(first, first + stretch)
             yield self._stretch(self.motion.iloc[rows], None if decisions is None else decisions.by_rows(rows))
 
     def _stretch(self, motion: pd.DataFrame, decisions: Decisions | None) -> Columns:

@@ -33,7 +33,7 @@ from hrcreplay.pipeline.person_fuser import PersonFuser
 from hrcreplay.pipeline.run_config import RunConfig
 from hrcreplay.pipeline.second_process import read_apart, write_apart
 from hrcreplay.pipeline.seen_bodies import SeenBodies
-from hrcreplay.records import JOINTS, LENGTHS, RECORDED, Floats, HumanStates, Ints
+from hrcreplay.records import JOINTS, LENGTHS, RECORDED, Bools, Floats, HumanStates, Ints
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.recorded import RecordedCapsules
 from hrcreplay.store.columns import Columns, body_columns
@@ -155,11 +155,13 @@ def _judge(judged: _JudgedRun, log: Log, writer: RunWriter, second: Executor | N
 
 def _write_body(judged: _JudgedRun, ticks_ns: Ints, writer: RunWriter) -> None:
     """Writes the recorded body at some of the ticks."""
-    settings = judged.run_config.settings
+    settings, people = judged.run_config.settings, judged.people
     shown_ns = ticks_ns[:: max(1, round(settings.fusion.rate_hz / _BODY_HZ))]
-    for first in range(0, len(shown_ns), _BATCH):
-        some_ns = shown_ns[first : first + _BATCH]
-        writer.table("body", body_table(judged.people, some_ns, settings.prediction.hand_m))
+    size = -(-_BATCH // len(people.people))
+    for first in range(0, len(shown_ns), size):
+        before = min(first, 1)
+        some_ns = shown_ns[first - before : first + size]
+        writer.table("body", body_table(people, some_ns, settings.prediction.hand_m, before))
 
 
 def _move_rows(path: Path, writer: RunWriter) -> None:
@@ -255,12 +257,27 @@ def _forget_there() -> None:
     release_freed_memory()
 
 
-def body_table(people: RecordedPeople, at_ns: Ints, hand_m: float) -> Columns:
-    """Returns the columns of body.parquet: the capsules of every person at each instant, in order of time."""
-    numbers = [one.number for one in people.people]
+def body_table(people: RecordedPeople, at_ns: Ints, hand_m: float, before: int = 0) -> Columns:
+    """Returns the columns of body.parquet: the capsules of the people at each instant, in order of time.
+
+    Of several people, those of whom anything is known then or was an instant before: an hour has many visitors.
+
+    Args:
+        people: The recorded people.
+        at_ns: (m,) instants, increasing [ns].
+        hand_m: Length of a hand beyond the wrist [m].
+        before: Number of the first instants that have no rows.
+    """
+    numbers = np.array([one.number for one in people.people], dtype=np.int64)
     each = np.stack([body_axes(one.tracks, at_ns, hand_m) for one in people.people], axis=1)
-    person = None if numbers == [1] else np.tile(np.array(numbers, dtype=np.int64), len(at_ns))
-    return body_columns(np.repeat(at_ns, len(numbers)), each.reshape(-1, *each.shape[2:]), PARTS, person)
+    if len(numbers) == 1:
+        person = None if numbers[0] == 1 else np.full(len(at_ns) - before, numbers[0])
+        return body_columns(at_ns[before:], each[before:, 0], PARTS, person)
+    there: Bools = np.asarray(np.isfinite(each).any(axis=(2, 3, 4)))
+    there[1:] |= there[:-1].copy()
+    there[:before] = False
+    instant, which = np.nonzero(there)
+    return body_columns(at_ns[instant], each[instant, which], PARTS, numbers[which])
 
 
 def body_axes(person: Sequence[BodyTrack], at_ns: Ints, hand_m: float) -> Floats:

@@ -13,7 +13,7 @@ import pandas as pd
 from scipy.spatial.transform import Rotation
 
 from hrcreplay.human.model import skeleton
-from hrcreplay.records import JOINTS, LENGTHS, POINTS, RECORDED, Bools, Floats, Ints, of_person
+from hrcreplay.records import JOINTS, LENGTHS, OF_PERSON, POINTS, RECORDED, Bools, Floats, Ints
 from hrcreplay.reporting.figures.drawing import BONES
 from hrcreplay.reporting.metrics.contact import StopEvent, method_prefixes, motion_of, stop_events
 from hrcreplay.reporting.metrics.people import named_volumes
@@ -33,6 +33,9 @@ from hrcreplay.store.stored_table import RunTable, number_columns, text_column
 RATE_HZ, WHOLE_S = 25.0, 600.0
 #: Maximum rate of volumes in the replay [Hz], and that of a longer run.
 VOLUME_HZ, LONG_VOLUME_HZ = 12.5, 5.0
+#: Number of people up to which each is drawn on its own; of more, those who are there in turn are drawn as one, as the
+#: numbers of a long run with many visitors would fill the memory.
+_APART = 8
 #: Maximum age of a row of a table at an instant [s].
 _STALE_S = 0.2
 #: Frames whose skeletons are computed together.
@@ -166,7 +169,7 @@ class ReplayScene:
     methods: dict[str, MethodTrack]  #: the run's own first
     watched_m: Floats  #: (k, 2) corners of the watched area, on the floor; k is 0 if the cell gives none
     objects: tuple[StaticHull, ...] = ()  #: convex parts of the objects of the cell, without half-spaces
-    people: tuple[int, ...] = (1,)  #: (k,) numbers of the people
+    people: tuple[str, ...] = ("1",)  #: (k,) numbers of the people; "7 or another": of several, there in turn
     cameras: tuple[CameraSight, ...] = ()
     rate_hz: float = RATE_HZ
 
@@ -328,23 +331,62 @@ def replay_scene(
     if RECORDED in tables and not tables[RECORDED]["q1"].notna().any():  # its joints are not recorded
         del tables[RECORDED]
     slow = float(setting(run.meta.get("settings", {}), "report", "stationary_m_per_s"))
-    each = [run.of_person(number) for number in run.people]
+    people, points_m, body_m = _people(run, parts, t_ns)
     return ReplayScene(
         t0_ns=t0_ns,
         t_ns=t_ns,
-        points_m=np.concatenate([_fused(one.state, t_ns) for one in each], axis=1),
-        body_m=np.concatenate([_body(one.body, parts, t_ns) for one in each], axis=1),
-        body_parts=tuple(of_person(part, number) for number in run.people for part in parts),
-        body_radius_m=np.tile([radii_m[part] for part in parts], len(each)),
+        points_m=points_m,
+        body_m=body_m,
+        body_parts=tuple(part if one == "1" else f"{part}{OF_PERSON}{one}" for one in people for part in parts),
+        body_radius_m=np.tile([radii_m[part] for part in parts], len(people)),
         volumes=volume_track(named_volumes(run.occupancy), VOLUME_HZ if every == 1 else LONG_VOLUME_HZ),
         robot=robot_geometry(robot, (run.meta.get("urdf") or {}).get("text")),
         methods={name: _track(run, name, table, robot, t_ns, t0_ns, slow) for name, table in tables.items()},
         watched_m=np.array(((run.meta.get("cell") or {}).get("watched") or {}).get("corners_m", [])).reshape(-1, 2),
         objects=tuple(objects),
-        people=run.people,
+        people=people,
         cameras=tuple(camera_sights(run.meta)),
         rate_hz=RATE_HZ / every,
     )
+
+
+def _people(run: Run, parts: tuple[str, ...], t_ns: Ints) -> tuple[tuple[str, ...], Floats, Floats]:
+    """Returns ``people``, ``points_m`` and ``body_m`` of a scene, for the parts of bodies at instants (n,) [ns]."""
+    each = [run.of_person(number) for number in run.people]
+    spans = [_span(one, t_ns) for one in each]
+    drawn = [[k] for k in range(len(each))] if len(each) <= _APART else _in_turn(spans)
+    shown = len(SHOWN_POINTS)
+    points_m = np.full((len(t_ns), len(drawn) * shown, 3), np.nan)
+    body_m = np.full((len(t_ns), len(drawn) * len(parts), 2, 3), np.nan)
+    for i, members in enumerate(drawn):
+        for k in members:
+            rows, one = slice(*spans[k]), each[k]
+            points_m[rows, i * shown : (i + 1) * shown] = _fused(one.state, t_ns[rows])
+            body_m[rows, i * len(parts) : (i + 1) * len(parts)] = _body(one.body, parts, t_ns[rows])
+    names = tuple(f"{run.people[k]}" + " or another" * bool(more) for k, *more in drawn)
+    return names, points_m, body_m
+
+
+def _span(one: Run, t_ns: Ints) -> tuple[int, int]:
+    """Returns from which to before which of instants (n,) [ns] a person may be shown."""
+    tables = [table for table in (one.state, one.body) if table is not None and len(table)]
+    if not tables:
+        return 0, 0
+    ends_ns = np.array([times(table)[[0, -1]] for table in tables])
+    last_ns = int(ends_ns[:, 1].max()) + round(_STALE_S * 1e9)
+    return int(np.searchsorted(t_ns, ends_ns[:, 0].min())), int(np.searchsorted(t_ns, last_ns, side="right"))
+
+
+def _in_turn(spans: Sequence[tuple[int, int]]) -> list[list[int]]:
+    """Distributes people with these spans: the first one alone, the others with those who are gone before they come."""
+    found = [[0]]
+    for k in sorted(range(1, len(spans)), key=lambda k: spans[k]):
+        free = [members for members in found[1:] if spans[members[-1]][1] <= spans[k][0]]
+        if free:
+            free[0].append(k)
+        else:
+            found.append([k])
+    return found
 
 
 def _rows(table: RunTable, at_ns: Ints) -> tuple[Ints, Bools]:

@@ -324,7 +324,7 @@ def _person(scene: ReplayScene) -> Iterator[Message]:
         messages.PackedElementField(name=axis, offset=4 * i, type=messages.PackedElementFieldNumericType.Float32)
         for i, axis in enumerate("xyz")
     ]
-    names = ["" if number == 1 else f" {number}" for number in scene.people]
+    names = ["" if one == "1" else f" {one}" for one in scene.people]
     pairs = np.split(scene.bones, len(names))
     owned = np.split(np.arange(len(scene.body_parts)), len(names))
     shown, body = np.round(scene.points_m, 3), np.round(scene.body_m, 3)

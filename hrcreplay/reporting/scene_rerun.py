@@ -218,8 +218,8 @@ def _log_people(recording: Any, scene: ReplayScene) -> None:
     """Logs the recorded body and the fused skeleton of each person."""
     count = len(scene.people)
     owned = np.split(np.arange(len(scene.body_parts)), count)
-    for number, parts, pairs in zip(scene.people, owned, np.split(scene.bones, count), strict=True):
-        place = f"world/person_{number}"
+    for one, parts, pairs in zip(scene.people, owned, np.split(scene.bones, count), strict=True):
+        place = f"world/person_{one.replace(' ', '_')}"
         known = np.isfinite(scene.body_m[:, parts]).all(axis=(2, 3))
         if known.any():
             radius_m = np.broadcast_to(scene.body_radius_m[parts], known.shape)

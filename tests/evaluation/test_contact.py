@@ -16,6 +16,7 @@ from hrcreplay.commands import replay, report
 from hrcreplay.evaluation import contact
 from hrcreplay.evaluation.contact import VOLUME_OF, Volumes
 from hrcreplay.evaluation.containment import Coverage
+from hrcreplay.evaluation.judging import body_table
 from hrcreplay.evaluation.recorded_person import BodyTrack, RecordedPeople, RecordedPerson, SmoothedPeople, from_states
 from hrcreplay.human.model import PARTS, skeleton
 from hrcreplay.logs import reader
@@ -356,3 +357,29 @@ def test_where_no_camera_saw_anybody_the_smoothed_person_is_not_known(with_truth
     expected[40:101] = True
     expected[180] = True
     np.testing.assert_array_equal(known, expected)
+
+
+def test_of_several_people_those_have_a_body_of_whom_anything_is_known() -> None:
+    """And one more row, that they are gone; whatever instants are written together."""
+    at_ns = DT_NS * np.arange(60)
+    first, second = (standing_beside(around(0.3), 60), standing_beside(around(0.9), 60))
+    some = slice(20, 30)
+    visitor = BodyTrack(second.source, second.t_ns[some], second.points_m[some])
+    people = RecordedPeople(
+        tuple(
+            RecordedPerson(k, one.source, one.t_ns, one.points_m[:], (one,)) for k, one in ((1, first), (2, visitor))
+        ),
+        (),
+    )
+    whole = body_table(people, at_ns, 0.0)
+    of_second = whole["person"] == 2
+    known = at_ns[(at_ns >= at_ns[20]) & (at_ns <= at_ns[29])]
+    np.testing.assert_array_equal(whole["t_ns"][~of_second], at_ns)
+    assert whole["t_ns"][of_second][: len(known)].tolist() == known.tolist()
+    shown = np.isfinite(np.stack([whole[name][of_second] for name in list(whole)[2:]])).any(axis=0)
+    assert shown.tolist() == [True] * len(known) + [False]
+    parts = [body_table(people, at_ns[max(0, a - 1) : a + 25], 0.0, min(a, 1)) for a in range(0, 60, 25)]
+    for name, column in whole.items():
+        np.testing.assert_array_equal(np.concatenate([part[name] for part in parts]), column)
+    alone = body_table(dataclasses.replace(people, people=people.people[1:]), at_ns, 0.0)
+    assert alone["person"].tolist() == [2] * 60

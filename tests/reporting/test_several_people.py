@@ -7,20 +7,22 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from hrcreplay.human.model import PARTS
 from hrcreplay.reporting.figures import catalogue
 from hrcreplay.reporting.figures.catalogue import FigureData
 from hrcreplay.reporting.figures.prediction import skeleton_at, skeletons_at
-from hrcreplay.reporting.metrics.people import named_volumes
+from hrcreplay.reporting.metrics.people import most_tracked, named_volumes
 from hrcreplay.reporting.page import report_page
 from hrcreplay.reporting.page.replay_page import replay_data, snapshot, solids
 from hrcreplay.reporting.replay_scene import SHOWN_POINTS
 from hrcreplay.reporting.scene_mcap import write_scene
+from hrcreplay.store.run_folder import Run
 from tests.reporting.moving import SECOND_M, moving_run, moving_scene, two_people
 from tests.reporting.reading import read
-from tests.reporting.synthetic import metrics_of
+from tests.reporting.synthetic import frame_of, metrics_of
 from tests.reporting.test_scene_mcap import _topics
 
 ONE, BOTH = moving_scene(moving_run(4.0)), moving_scene(two_people(moving_run(4.0)))
@@ -39,7 +41,7 @@ def test_figures_draw_nobody_who_has_gone() -> None:
 
 
 def test_the_second_person_is_shown_where_it_is() -> None:
-    assert BOTH.people == (1, 2)
+    assert BOTH.people == ("1", "2")
     count = len(SHOWN_POINTS)
     np.testing.assert_array_equal(BOTH.points_m[:, :count], ONE.points_m)
     np.testing.assert_allclose(BOTH.points_m[:, count:], ONE.points_m + SECOND_M, atol=1e-12)
@@ -132,3 +134,48 @@ def test_figures_of_the_volumes_hold_those_of_both(drawn: Path, tmp_path: Path) 
     assert limbs is not None
     assert "LRA of person 2" in set(limbs["limb"])
     assert named_volumes(one.occupancy) is one.occupancy
+
+
+def visited(visitors: int) -> Run:
+    """The run with visitors, one after the other, but the last two at the same time."""
+    run = two_people(moving_run(4.0))
+    assert run.state is not None
+    assert run.body is not None
+    tables = {}
+    for name, table in (("state", frame_of(run.state)), ("body", frame_of(run.body))):
+        at_s = (table["t_ns"] - table["t_ns"].iloc[0]) * 1e-9
+        parts = [table[table["person"] == 1]]
+        for k in range(visitors):
+            from_s = 1.0 + 0.3 * min(k, visitors - 2)
+            mine = (table["person"] == 2) & (at_s >= from_s) & (at_s < from_s + 0.04)
+            parts.append(table[mine].assign(person=2 + k))
+        tables[name] = pd.concat(parts).sort_values(["t_ns", "person"], kind="stable").reset_index(drop=True)
+    return replace(run, state=tables["state"], body=tables["body"])
+
+
+def test_many_visitors_are_drawn_in_turn() -> None:
+    """Those of a long run would fill the memory; who is there at the same time is drawn apart."""
+    scene, count = moving_scene(visited(9)), len(SHOWN_POINTS)
+    assert scene.people == ("1", "2 or another", "10")
+    np.testing.assert_array_equal(scene.points_m[:, :count], ONE.points_m)
+    each = [np.isfinite(scene.points_m[:, k * count]).all(axis=1) for k in range(3)]
+    there = np.isfinite(scene.points_m[:, count : 2 * count]).any(axis=(1, 2))
+    begun = np.flatnonzero(np.diff(there.astype(int), prepend=0) == 1)
+    assert len(begun) == 8
+    np.testing.assert_allclose(scene.points_m[begun, count : 2 * count], BOTH.points_m[begun, count:], atol=1e-12)
+    assert each[2].sum() > 0
+    assert not (each[2] & ~each[1]).any()
+    assert scene.body_parts[PARTS_SHOWN] == f"{PARTS[0]} of person 2 or another"
+    assert "head of person 2 or another" in json.loads(replay_data(scene)[0])["body"]["parts"]
+    apart = moving_scene(visited(7))
+    assert apart.people == tuple("12345678")
+
+
+def test_figures_of_one_person_are_those_of_who_was_there_longest() -> None:
+    run = visited(9)
+    assert run.state is not None
+    longer = frame_of(run.state)
+    longer["person"] = longer["person"].replace({4: 7})
+    run = replace(run, state=longer)
+    assert most_tracked(run, 2) == (1, 7)
+    assert most_tracked(run, 20) == run.people

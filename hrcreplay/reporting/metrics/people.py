@@ -23,6 +23,16 @@ def named_volumes(occupancy: RunTable | None) -> RunTable | None:
     return occupancy.assign(limb=[of_person(limb, number) for limb, number in pairs])
 
 
+def most_tracked(run: Run, most: int) -> tuple[int, ...]:
+    """Numbers of the first person and of the others who were tracked for longest, ``most`` in all."""
+    if run.state is None or len(run.people) <= most:
+        return run.people
+    first, *others = run.people
+    ticks = np.bincount(run.state["person"].to_numpy(dtype=np.int64))
+    longest = sorted(others, key=lambda number: (-ticks[number], number))[: most - 1]
+    return first, *sorted(longest)
+
+
 def add_people(metrics: MetricTable, run: Run) -> None:
     """Adds the metrics of each person, and of all together; nothing for a run with one person.
 

@@ -162,14 +162,19 @@ class NumberBlock:
         table = np.asarray(values).reshape(len(values), math.prod(values.shape[1:]))
         largest = max((float(np.abs(column[np.isfinite(column)]).max(initial=0.0)) for column in table.T), default=0.0)
         unit = max(unit, largest / _LARGEST)
-        steps = np.array([_steps(column, unit) for column in table.T], dtype=np.uint16)
-        self._parts += [(steps & 0xFF).astype(np.uint8).tobytes(), (steps >> 8).astype(np.uint8).tobytes()]
+        low, high = bytearray(), bytearray()
+        for column in table.T:
+            steps = _steps(column, unit)
+            low += (steps & 0xFF).astype(np.uint8).tobytes()
+            high += (steps >> 8).astype(np.uint8).tobytes()
+        self._parts += [bytes(low), bytes(high)]
         self.entries[name] = {"at": self._at, "rows": len(table), "columns": table.shape[1], "unit": unit}
-        self._at += 2 * steps.size
+        self._at += 2 * table.size
 
     def deflated(self) -> bytes:
         """Returns the whole block as a zlib stream."""
-        return zlib.compress(b"".join(self._parts), 6)
+        stream = zlib.compressobj(6)
+        return b"".join([*map(stream.compress, self._parts), stream.flush()])
 
 
 def _steps(column: NDArray[Any], unit: float) -> NDArray[np.uint16]:

@@ -17,6 +17,7 @@ from hrcreplay.records import LIMBS, RECORDED
 from hrcreplay.reporting import summary_text
 from hrcreplay.reporting.figures.catalogue import FIGURES, FigureKind, file_name
 from hrcreplay.reporting.metrics.fusion import cameras
+from hrcreplay.reporting.metrics.people import TRACKED
 from hrcreplay.reporting.metrics.series import Metric
 from hrcreplay.reporting.page.replay_page import ReplayPart
 from hrcreplay.reporting.severity import severity_tables
@@ -86,7 +87,7 @@ def render(
         stops: The longest stops, shown with the safety.
         title: Name of the session; none: the name of the first input.
         replay: The 3-D replay; None: without one.
-        people: Numbers of the people in the run.
+        people: Numbers of the people who have figures.
 
     Returns:
         HTML without requests, times or paths.
@@ -162,7 +163,7 @@ def _parts(
         PageSection(
             "data",
             "Data quality",
-            "Content of the log, and its defects.",
+            "Content of the log, and its defects." + _left_out(metrics, people),
             _figures(figures_dir, "data", people),
             (
                 compare("Cameras", metrics, {name: f"camera_{name}" for name in seen}, CAMERA),
@@ -186,6 +187,16 @@ def _figures(folder: Path, section: str, people: Sequence[int] = (1,)) -> tuple[
     return tuple(
         PageFigure(name, caption, inline_svg(folder / f"{name}.svg", name, caption), wide=False)
         for name, caption in found
+    )
+
+
+def _left_out(metrics: Mapping[str, Metric], people: Sequence[int]) -> str:
+    """Says that not everybody has figures, if that is so."""
+    count = int(metrics[TRACKED]["value"]) if TRACKED in metrics else len(people)
+    if count <= len(people):
+        return ""
+    return (
+        f" Figures of one person show person {people[0]} and the {len(people) - 1} others tracked longest, of {count}."
     )
 
 
