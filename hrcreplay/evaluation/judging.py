@@ -167,7 +167,7 @@ def _write_body(judged: _JudgedRun, ticks_ns: Ints, writer: RunWriter) -> None:
 def _move_rows(path: Path, writer: RunWriter) -> None:
     """Appends the rows of a motion to contact.parquet and removes their file."""
     with pq.ParquetFile(path, pre_buffer=False) as file:
-        for batch in file.iter_batches(batch_size=STRETCH):
+        for batch in file.iter_batches(batch_size=TableWriter.ROWS):  # with many people, many columns
             writer.table("contact", dict(zip(batch.schema.names, batch.columns, strict=True)))
     path.unlink()
 
