@@ -285,14 +285,23 @@ def _held(metrics: Metrics) -> str:
     return f"The predicted volumes held every limb that was seen ({judge}) {', and '.join(parts)}.{_held_each(metrics)}"
 
 
+#: Number of people up to which the verdict names each.
+_NAMED = 8
+
+
 def _held_each(metrics: Metrics) -> str:
     """Describes the coverage of each of several people until the horizon."""
     shares = {
-        name.split("_")[1]: metric["value"]
+        int(name.split("_")[1]): metric["value"]
         for name, metric in metrics.items()
         if name.startswith("person_") and name.endswith("_volumes_held_share") and metric["value"] is not None
     }
-    each = ", ".join(f"person {number} at {share_text(share)}" for number, share in shares.items())
+    texts = {number: f"person {number} at {share_text(share)}" for number, share in sorted(shares.items())}
+    each = ", ".join(texts.values())
+    if len(shares) > _NAMED:
+        first, *others = texts
+        least = min(others, key=lambda number: (shares[number], number))
+        each = f"{texts[first]} and the {len(others)} others at {share_text(shares[least])} (person {least}) or more"
     return f" Until their horizon they held {each} of the ticks checked of each." if each else ""
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -19,6 +20,7 @@ from hrcreplay.reporting.page import report_page
 from hrcreplay.reporting.page.replay_page import replay_data, snapshot, solids
 from hrcreplay.reporting.replay_scene import SHOWN_POINTS
 from hrcreplay.reporting.scene_mcap import write_scene
+from hrcreplay.reporting.verdict import _held_each
 from hrcreplay.store.run_folder import Run
 from tests.reporting.moving import SECOND_M, moving_run, moving_scene, two_people
 from tests.reporting.reading import read
@@ -179,3 +181,16 @@ def test_figures_of_one_person_are_those_of_who_was_there_longest() -> None:
     run = replace(run, state=longer)
     assert most_tracked(run, 2) == (1, 7)
     assert most_tracked(run, 20) == run.people
+
+
+def test_the_verdict_names_each_of_few_people_and_the_least_held_of_many() -> None:
+    shares = {1: 0.99, 2: 0.9, 3: 0.6, 10: 0.95, 11: 0.6}
+    metrics: dict[str, Any] = {f"person_{k}_volumes_held_share": {"value": share} for k, share in shares.items()}
+    few = dict(sorted(metrics.items()))
+    names = "person 1 at 99.0 %, person 2 at 90.0 %, person 3 at 60.0 %, person 10 at 95.0 %, person 11 at 60.0 %"
+    assert _held_each(few) == f" Until their horizon they held {names} of the ticks checked of each."
+    many = few | {f"person_{k}_volumes_held_share": {"value": 0.8} for k in range(20, 25)}
+    assert _held_each(many) == (
+        " Until their horizon they held person 1 at 99.0 % and the 9 others at 60.0 % (person 3) or more of the ticks "
+        "checked of each."
+    )
