@@ -82,8 +82,8 @@ def limb_outside_m(
 def test_legs_that_a_table_hides_stay_in_their_volume(parts: tuple[str, ...], kind: str) -> None:
     """Hips alone do not tell where knees and ankles are, from the start or from when people stand.
 
-    Hidden in the midst of the quickest rise or squat, legs leave it for some hundredths of a second by 3 cm at most: they
-    had not yet swayed much when they were seen last.
+    Hidden in the midst of the quickest rise or squat, legs leave it for some hundredths of a second by 3 cm at most:
+    they had not yet swayed much when they were seen last.
     """
     measurements, end_s = rising.seen(0.6, kind, SEEDS[0])
     for from_s in (0.0, 3.0, *MIDWAY_S):
