@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
 
 from hrcreplay.records import of_person
 from hrcreplay.reporting.metrics.contact import method_prefixes
@@ -19,8 +20,10 @@ def named_volumes(occupancy: RunTable | None) -> RunTable | None:
     """Returns the volumes of all people, each limb named with its person; the table itself for one person."""
     if occupancy is None or "person" not in occupancy:
         return occupancy
-    pairs = zip(occupancy["limb"].astype(str), occupancy["person"].tolist(), strict=True)
-    return occupancy.assign(limb=[of_person(limb, number) for limb, number in pairs])
+    limb, limbs = pd.factorize(occupancy["limb"])
+    pairs, which = np.unique(occupancy["person"].to_numpy(dtype=np.int64) * len(limbs) + limb, return_inverse=True)
+    names = [of_person(str(limbs[k % len(limbs)]), k // len(limbs)) for k in pairs.tolist()]
+    return occupancy.assign(limb=np.array(names, dtype=object)[which])  # each name is in memory once
 
 
 def most_tracked(run: Run, most: int) -> tuple[int, ...]:
