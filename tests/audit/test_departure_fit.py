@@ -300,7 +300,7 @@ def test_lines_fitted_to_others_are_widened_until_enough_of_these_people_are_ins
     for k, (factor, horizon_s) in enumerate(zip(factors.tolist(), folds[0].horizon_s.tolist(), strict=True)):
         margin = 0.8 if horizon_s < 0.25 else 1.0  # by whose end robots beside people have stopped
         assert 1.0 < factor < 1.5
-        assert share(factor, k) >= 1.0 - margin * 0.05 > share(factor - 0.02, k)
+        assert share(factor, k) >= 1.0 - margin * 0.05 > share(factor - 0.0101, k)
     wide = departure_fit.widen(folds[0], factors)
     np.testing.assert_allclose(wide.beyond_m, factors * folds[0].beyond_m, atol=1e-3)
     assert (wide.residuals >= factors * folds[0].residuals - 1e-9).all()

@@ -7,16 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hrcreplay.audit.departures import LimbDepartures, departures
+from hrcreplay.audit.departures import LimbDepartures, _some, departures
 from hrcreplay.commands import replay
 from hrcreplay.evaluation.recorded_person import CAMERAS, TRUTH
 from hrcreplay.evaluation.recording import Recording
 from hrcreplay.human.model import LEG_POINTS, PELVIS, Departure, skeleton
+from hrcreplay.limits import load_limits
 from hrcreplay.pipeline import assembly
 from hrcreplay.pipeline.run_config import resolve
 from hrcreplay.records import BODY, DOF, LIMBS, Floats, HumanStates
 from hrcreplay.settings.sections import Prediction
-from tests.human.people import states
+from tests.human.people import random_states, states
 
 #: What people do upwards [m/s], how often it is recorded [s], and the residual that they are said to have [m].
 UP_M_PER_S, EVERY_S, RESIDUAL_M = 1.6, 0.02, 0.02
@@ -115,3 +116,11 @@ def test_legs_of_somebody_new_depart_from_where_they_may_be() -> None:
         for k, left_m in enumerate(far):
             found = of.beyond_m(k, 0.0, 0.0)[0, BODY.index("LEGS")]
             assert found == pytest.approx(max(0.0, left_m - held_m), abs=1e-6)
+
+
+def test_volumes_are_those_of_evenly_spread_ticks() -> None:
+    """The first tick, at which cameras have shown the person once, counts as any other."""
+    every = random_states(load_limits("people"), 1000, 1)
+    np.testing.assert_array_equal(_some(every).p, every.p[5::10])
+    assert len(_some(every.rows(slice(0, 7)))) == 7
+    assert len(_some(every.rows(slice(0, 0)))) == 0

@@ -106,6 +106,8 @@ def test_who_is_gone_is_smoothed_and_forgotten(run: tuple[HumanStates, Trace], s
     alone = smooth(states.rows(visit), trace.rows(visit), SETTINGS)
     np.testing.assert_array_equal(visitor.p, alone.p)
     assert set(visitor.numbers.tolist()) == {2}
+    nobody = slice(0, 0)
+    assert people.add(both.rows(nobody), traces.rows(nobody)) == []  # ticks without rows tell of nobody
     (last,) = people.finish()
     np.testing.assert_array_equal(last.p, smooth(states, trace, SETTINGS).p)
 
