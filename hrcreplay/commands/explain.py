@@ -132,7 +132,7 @@ class Record:
 
     @cached_property
     def frames(self) -> dict[str, tuple[Ints, Ints]]:
-        """Camera -> arrivals of its frames in order, and the newest capture until each [ns]; of none without them."""
+        """Camera -> arrivals of its frames in order, and the newest capture until each [ns]; empty if not kept."""
         path = self.folder / "measurements.parquet"
         if not path.exists():
             return {}

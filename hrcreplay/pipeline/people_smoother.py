@@ -14,7 +14,7 @@ from hrcreplay.settings.sections import Fusion
 class PeopleSmoother:
     """Smooths each person of a run; rows of one person are in order of time.
 
-    Nobody who is forgotten comes back under the same number, so that the memory is that of the people who are there.
+    No person who is forgotten comes back under the same number, so the memory is that of the people who are there.
     """
 
     def __init__(self, settings: Fusion) -> None:
@@ -28,9 +28,10 @@ class PeopleSmoother:
             mine = np.flatnonzero(states.numbers == number)
             one = self._each.setdefault(number, StretchSmoother(self._settings))
             found += _numbered(one.add(states.of_person(number), trace.rows(mine)), number)
-        there = set(states.numbers[states.t_ns == states.t_ns[-1:]].tolist()) or self._each.keys()
-        for number in sorted(self._each.keys() - there):
-            found += _numbered(self._each.pop(number).finish(), number)
+        if len(states):  # else nobody was seen yet
+            there = states.numbers[states.t_ns == states.t_ns[-1]]
+            for number in sorted(self._each.keys() - set(there.tolist())):
+                found += _numbered(self._each.pop(number).finish(), number)
         return found
 
     def finish(self) -> list[HumanStates]:

@@ -56,6 +56,7 @@ from hrcreplay.human.prediction.sweep import (
     sweep_walk,
 )
 from hrcreplay.human.prediction.velocity_tube import (
+    HANGS_ON,
     HEAD_LIMB,
     LEGS,
     MOST_POINTS,
@@ -90,8 +91,8 @@ MOST_CORNERS = 256
 #: Size above which a set is reduced before the next rotation.
 _MANY_CORNERS = 40
 
-#: For each of LIMBS the one on which it hangs, and the index of its length in LENGTHS; the thorax hangs on none.
-_HANGS_ON, _LENGTH_OF = np.array([THORAX, THORAX, THORAX, URA, THORAX, ULA]), np.array([1, 0, 4, 6, 3, 5])
+#: For each of LIMBS the index of its length in LENGTHS.
+_LENGTH_OF = np.array([1, 0, 4, 6, 3, 5])
 
 
 class SoundRules(NamedTuple):
@@ -286,7 +287,7 @@ def _tube(i: int, limb: int, rows: SoundRows, span_s: float, rules: SoundRules, 
 
 @njit(cache=True, inner=True)
 def _hanging(i: int, limb: int, rows: SoundRows, span_s: float, rules: SoundRules, swept: Floats) -> tuple[int, float]:
-    """Writes the tube of the limb on which one out of sight hangs: it is within its length of there.
+    """Writes the tube of the nearest limb up the chain that has one; a limb out of sight is within its length of there.
 
     Returns:
         Number of points, 0 if no limb up the chain has a tube, and the radius, which includes the limb's own [m].
@@ -295,7 +296,7 @@ def _hanging(i: int, limb: int, rows: SoundRows, span_s: float, rules: SoundRule
     while by != THORAX and not rows.tubed.usable[i, by]:
         k = _LENGTH_OF[by]
         length += rows.lengths[i, k] + rows.lengths_off[i, k]
-        by = _HANGS_ON[by]
+        by = HANGS_ON[by]
     if not rows.tubed.usable[i, by]:
         return 0, np.nan
     if (limb - 2) % 2 == 1:

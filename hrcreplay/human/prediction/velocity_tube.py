@@ -18,7 +18,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hrcreplay.human.model import ARM_POINTS, BENDS, HANDS, HEAD, LEG_POINTS, NECK, PELVIS, LimitSet, skeleton_row
+from hrcreplay.human.model import (
+    ARM_POINTS,
+    BENDS,
+    HANDS,
+    HEAD,
+    LEG_POINTS,
+    NECK,
+    PELVIS,
+    ULA,
+    URA,
+    LimitSet,
+    skeleton_row,
+)
 from hrcreplay.human.prediction.sound_reach import knees_out
 from hrcreplay.kernels import njit
 from hrcreplay.records import BODY, LIMBS, POINTS, Bools, Floats, HumanStates
@@ -44,10 +56,14 @@ _ARMS_RISE_M = 0.06
 #: Minimum distance of a hand from its wrist that gives a direction [m].
 _SHORT_M = 0.02
 HEAD_LIMB, THORAX, LEGS = (BODY.index(limb) for limb in ("HD", "THX", "LEGS"))
-#: For each limb of BODY, True for itself and those of BODY that carry it: an arm on an unseen torso is unknown.
-_CARRIED_BY = np.zeros((7, 7), dtype=np.bool_)
-for _limb, _carrying in enumerate(((0, 1), (1,), (1, 2), (1, 2, 3), (1, 4), (1, 4, 5), (1,))):
-    _CARRIED_BY[_limb, _carrying] = True
+#: For each limb of BODY the one on which it hangs; all hang on the thorax in the end.
+HANGS_ON = np.array([THORAX, THORAX, THORAX, URA, THORAX, ULA, THORAX])
+#: For each limb of BODY, True for itself and those of BODY that carry it: an arm on an unseen torso is unknown. For the
+#: legs the torso alone, as legs out of sight have a tube, too.
+_CARRIED_BY = np.eye(len(BODY), dtype=np.bool_)
+_CARRIED_BY[LEGS, LEGS] = False
+for _limb, _carrying in enumerate(HANGS_ON):
+    _CARRIED_BY[_limb, [_carrying, HANGS_ON[_carrying]]] = True
 #: Speed above which the bound on a limb's departure grows no further [m/s].
 FASTEST_M_PER_S = 1.0
 #: Speeds at which people walk and reach, ISO 13855; of each limb of BODY [m/s].

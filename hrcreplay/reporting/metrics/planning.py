@@ -84,7 +84,7 @@ def programme_progress(motion: RunTable, ahead_m: float) -> tuple[float, float] 
         motion: A table of motion.
         ahead_m: As for ``foot``: plan.max_reference_lead_m [m].
     """
-    (programmed, tcp), t_ns = ([f"{what}_{axis}" for axis in "xyz"] for what in ("ref", "tcp")), times(motion)
+    t_ns, programmed, tcp = times(motion), [f"ref_{axis}" for axis in "xyz"], [f"tcp_{axis}" for axis in "xyz"]
     known = np.all([np.isfinite(numeric_column(motion, name)) for name in ("programme_s", *programmed, *tcp)], axis=0)
     if known.sum() < 2:
         return None
