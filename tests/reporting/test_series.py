@@ -95,3 +95,15 @@ def test_no_line_of_a_path_crosses_a_gap() -> None:
         [9.0, 10.0, 11.0],
     ]
     assert series.thin_stretches(points[3:5], 1e-3) == []
+
+
+@pytest.mark.parametrize("dimensions", [2, 3])
+def test_the_way_along_a_path_has_the_bits_of_numpys_norm(dimensions: int) -> None:
+    """And a thinned path keeps the first point of every piece of the way, and the last."""
+    points = np.cumsum(np.random.default_rng(3).normal(0.0, 0.01, (500, dimensions)), axis=0)
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    np.testing.assert_array_equal(series.step_lengths(points), steps)
+    way = np.concatenate([[0.0], np.cumsum(steps)])
+    np.testing.assert_array_equal(series.way_along(points), way)
+    _, first = np.unique(np.floor(way / 0.05), return_index=True)
+    np.testing.assert_array_equal(series.thin_path(points, 0.05), points[np.union1d(first, [499])])
