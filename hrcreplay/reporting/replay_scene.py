@@ -352,15 +352,14 @@ def replay_scene(
 
 def _people(run: Run, parts: tuple[str, ...], t_ns: Ints) -> tuple[tuple[str, ...], Floats, Floats]:
     """Returns ``people``, ``points_m`` and ``body_m`` of a scene, for the parts of bodies at instants (n,) [ns]."""
-    each = [run.of_person(number) for number in run.people]
-    spans = [_span(one, t_ns) for one in each]
-    drawn = [[k] for k in range(len(each))] if len(each) <= _APART else _in_turn(spans)
+    spans = [_span(run.of_person(number), t_ns) for number in run.people]
+    drawn = [[k] for k in range(len(spans))] if len(spans) <= _APART else _in_turn(spans)
     shown = len(SHOWN_POINTS)
     points_m = np.full((len(t_ns), len(drawn) * shown, 3), np.nan)
     body_m = np.full((len(t_ns), len(drawn) * len(parts), 2, 3), np.nan)
     for i, members in enumerate(drawn):
         for k in members:
-            rows, one = slice(*spans[k]), each[k]
+            rows, one = slice(*spans[k]), run.of_person(run.people[k])
             points_m[rows, i * shown : (i + 1) * shown] = _fused(one.state, t_ns[rows])
             body_m[rows, i * len(parts) : (i + 1) * len(parts)] = _body(one.body, parts, t_ns[rows])
     names = tuple(f"{run.people[k]}" + " or another" * bool(more) for k, *more in drawn)

@@ -66,7 +66,7 @@ class TableWriter:
     If an optional column comes only with later rows, the earlier ones are written again with it.
     """
 
-    ROWS = 4096
+    ROWS = 8192
 
     def __init__(self, path: Path) -> None:
         self._path = path

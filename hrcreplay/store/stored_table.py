@@ -5,6 +5,7 @@ from __future__ import annotations
 import weakref
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar, Self, overload
@@ -20,7 +21,7 @@ from hrcreplay.records import Bools, Floats, Ints
 Anything = np.ndarray[tuple[int, ...], np.dtype[Any]]
 
 #: Number of groups of rows that are read together when only some of their rows are needed.
-_GROUPS = 16
+_GROUPS = 8
 #: Memory of the columns of all files that are kept, as most are asked for more than once [bytes].
 _KEPT_BYTES = 32_000_000
 
@@ -48,14 +49,23 @@ class StoredTable:
             made: Column beside those of the file, or in place of one -> (n,) its values in the rows of the table.
         """
         self._file = path if isinstance(path, _File) else _File.of(path)
-        self._rows, self._made = rows, dict(made or {})
+        self._made = dict(made or {})
+        self._bits = None if rows is None else np.packbits(rows)  # in a long run with visitors each has such tables
+        self._length = self._file.length if rows is None else int(np.count_nonzero(rows))
         self.columns = self._file.names if columns is None else tuple(columns)
 
     def __contains__(self, name: object) -> bool:
         return name in self.columns
 
     def __len__(self) -> int:
-        return self._file.length if self._rows is None else int(np.count_nonzero(self._rows))
+        return self._length
+
+    @property
+    def _rows(self) -> Bools | None:
+        """(n,) True for the rows of the file that belong to the table; None: all."""
+        if self._bits is None:
+            return None
+        return np.unpackbits(self._bits, count=self._file.length).view(np.bool_)
 
     @property
     def empty(self) -> bool:
@@ -81,10 +91,10 @@ class StoredTable:
         return self._where(np.asarray(key, dtype=np.bool_))
 
     def _where(self, mask: Bools) -> StoredTable:
-        rows = mask
-        if self._rows is not None:
-            rows = np.zeros(len(self._rows), dtype=np.bool_)
-            rows[np.flatnonzero(self._rows)[mask]] = True
+        rows, mine = mask, self._rows
+        if mine is not None:
+            rows = np.zeros(len(mine), dtype=np.bool_)
+            rows[np.flatnonzero(mine)[mask]] = True
         return StoredTable(self._file, self.columns, rows, {name: values[mask] for name, values in self._made.items()})
 
     @property
@@ -155,29 +165,42 @@ class _LastColumns:
 _LAST = _LastColumns()
 
 
+#: What tells a file from another one at the same place: its path, inode, size [bytes] and time of change [ns].
+_Identity = tuple[Path, int, int, int]
+
+
+@lru_cache(maxsize=1)
+def _description(identity: _Identity) -> pq.FileMetaData:
+    """Reads what a file says of its groups of rows. Only the last is kept, as those of an hour's tables take 130 MB."""
+    return pq.read_metadata(identity[0])
+
+
 class _File:
     """A parquet file."""
 
-    _open: ClassVar[weakref.WeakValueDictionary[tuple[str, int, int, int], _File]] = weakref.WeakValueDictionary()
+    _open: ClassVar[weakref.WeakValueDictionary[_Identity, _File]] = weakref.WeakValueDictionary()
 
     @classmethod
     def of(cls, path: Path) -> _File:
-        """The file; tables opened apart share it, as its description alone takes 70 MB for an hour of states."""
+        """The file; tables opened apart share it, and with it the columns that were read."""
         about = path.stat()
-        key = str(path), about.st_ino, about.st_size, about.st_mtime_ns
-        found = cls._open.get(key)
+        identity = path, about.st_ino, about.st_size, about.st_mtime_ns
+        found = cls._open.get(identity)
         if found is None:
-            found = cls._open[key] = cls(path)
+            found = cls._open[identity] = cls(identity)
         return found
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, identity: _Identity) -> None:
+        self._identity = identity
         weakref.finalize(self, _LAST.forget, id(self))
-        self._about = pq.read_metadata(path)
-        self.names = tuple(self._about.schema.to_arrow_schema().names)
-        self.length = int(self._about.num_rows)
-        counts = [self._about.row_group(i).num_rows for i in range(self._about.num_row_groups)]
+        about = _description(identity)
+        self.names = tuple(about.schema.to_arrow_schema().names)
+        self.length = int(about.num_rows)
+        counts = [about.row_group(i).num_rows for i in range(about.num_row_groups)]
         self._starts = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
+
+    def _opened(self) -> pq.ParquetFile:
+        return pq.ParquetFile(self._identity[0], metadata=_description(self._identity))
 
     def read(self, names: list[str], rows: Bools | None) -> pd.DataFrame:
         """Some columns, of all rows or of those (n,) that are True."""
@@ -191,7 +214,7 @@ class _File:
     def _some(self, names: list[str], rows: Bools, groups: list[int]) -> pd.DataFrame:
         """Some rows of some columns, read few groups of rows at a time: all columns of a long run would fill memory."""
         found = []
-        with pq.ParquetFile(self._path, metadata=self._about) as file:
+        with self._opened() as file:
             for k in range(0, len(groups), _GROUPS):
                 few = groups[k : k + _GROUPS]
                 kept = np.concatenate([rows[self._starts[i] : self._starts[i + 1]] for i in few])
@@ -203,7 +226,7 @@ class _File:
         """A whole column, kept or read."""
         found = _LAST.get(id(self), name)
         if found is None:
-            with pq.ParquetFile(self._path, metadata=self._about) as file:
+            with self._opened() as file:
                 found = file.read(columns=[name], use_threads=False).to_pandas()[name]
             _LAST.keep(id(self), name, found)
         return found

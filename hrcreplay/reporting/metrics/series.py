@@ -200,16 +200,18 @@ def path_feet(points: Floats, path: Floats) -> Floats:
 
     Searches the two segments at the nearest vertex, which is exact if vertices are dense relative to the curvature.
     """
-    path = thin_path(path[np.isfinite(path).all(axis=1)], _SAME_M)
+    path = np.ascontiguousarray(thin_path(path[np.isfinite(path).all(axis=1)], _SAME_M))
     feet = np.full(points.shape, np.nan)
     known = np.isfinite(points).all(axis=1)
     if not len(path) or not known.any():
         return feet
-    rows = np.flatnonzero(known)
-    nearest = _nearest_vertices(points[rows], path)
+    rows, vertices = np.flatnonzero(known), _vertices_apart(path)
     for first in range(0, len(rows), _TOGETHER):
-        some = slice(first, first + _TOGETHER)
-        feet[rows[some]] = _feet_beside(points[rows[some]], path, nearest[some])
+        some = rows[first : first + _TOGETHER]
+        at = np.ascontiguousarray(points[some])
+        nearest = vertices[nearest_vertices(at, path[vertices])]
+        follow_nearer(at, path, nearest)
+        feet[some] = _feet_beside(at, path, nearest)
     return feet
 
 
@@ -228,11 +230,11 @@ def _feet_beside(at: Floats, path: Floats, nearest: Ints) -> Floats:
     return best
 
 
-def _nearest_vertices(points: Floats, path: Floats) -> Ints:
-    """Returns (n,) indices of the vertices of a (m, 3) path nearest to (n, 3) points.
+def _vertices_apart(path: Floats) -> Ints:
+    """Returns the indices of one vertex of a (m, 3) path in each cell, neighbours one after the other.
 
-    A programme passes the same places in each cycle: only one vertex per cell is tested, and from there the search
-    follows the path while the distance decreases.
+    A programme passes the same places in each cycle: from the nearest of these vertices a search follows the path while
+    the distance decreases.
     """
     cell = np.zeros(len(path), np.int64)
     for coordinate in path.T:
@@ -240,11 +242,8 @@ def _nearest_vertices(points: Floats, path: Floats) -> Ints:
         along -= along.min()
         cell = cell * (along.max() + 1) + along
     _, first = np.unique(cell, return_index=True)
-    vertices = first[cKDTree(path[first]).indices]  # neighbours in space come one after the other
-    points, path = np.ascontiguousarray(points), np.ascontiguousarray(path)
-    found: Ints = vertices[nearest_vertices(points, path[vertices])]
-    follow_nearer(points, path, found)
-    return found
+    vertices: Ints = first[cKDTree(path[first]).indices]
+    return vertices
 
 
 #: Columns of the arms' joints.

@@ -151,7 +151,8 @@ class NumberBlock:
 
     def __init__(self) -> None:
         self.entries: dict[str, dict[str, Any]] = {}
-        self._parts: list[bytes] = []
+        self._stream = zlib.compressobj(6)
+        self._packed = bytearray()
         self._at = 0
 
     def add(self, name: str, values: Floats | Ints, unit: float = 1.0) -> None:
@@ -167,14 +168,13 @@ class NumberBlock:
             steps = _steps(column, unit)
             low += (steps & 0xFF).astype(np.uint8).tobytes()
             high += (steps >> 8).astype(np.uint8).tobytes()
-        self._parts += [bytes(low), bytes(high)]
+        self._packed += self._stream.compress(low) + self._stream.compress(high)
         self.entries[name] = {"at": self._at, "rows": len(table), "columns": table.shape[1], "unit": unit}
         self._at += 2 * table.size
 
     def deflated(self) -> bytes:
         """Returns the whole block as a zlib stream."""
-        stream = zlib.compressobj(6)
-        return b"".join([*map(stream.compress, self._parts), stream.flush()])
+        return bytes(self._packed) + self._stream.copy().flush()
 
 
 def _steps(column: NDArray[Any], unit: float) -> NDArray[np.uint16]:
