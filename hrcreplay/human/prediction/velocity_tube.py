@@ -51,6 +51,9 @@ _LEGS_AGE_S = 0.07
 #: Sway of legs, ``HumanStates.legs_sway_m``, that counts at least; that counts at most, as of people who walk, whose
 #: legs a tracker throws, or whose sway is not known; and of legs out of sight, as of somebody on one spot [m].
 _LEAST_SWAY_M, _MOST_SWAY_M, _HIDDEN_SWAY_M = 0.008, 0.03, 0.018
+#: How fast the sway of legs rises that begin to move when no camera shows them any more: an acceleration of 5 m/s^2
+#: times the 25 ms of a sway [m/s].
+_SWAY_RISES_M_PER_S = 0.125
 #: Maximum rise, and sink, of an arm's hull [m].
 _ARMS_RISE_M = 0.06
 #: Minimum distance of a hand from its wrist that gives a direction [m].
@@ -183,7 +186,9 @@ def _tube_rows(
                 own = residual_m[i, limb]
                 found.residual[i, limb] = max(unknown_m, displaced[limb]) if np.isnan(own) else own
         found.legs_new[i] = bounded and np.isnan(residual_m[i, THORAX])
-        found.residual[i, LEGS] = _sway_of(sway_m[i]) if found.legs_shown[i] else _HIDDEN_SWAY_M
+        found.residual[i, LEGS] = _HIDDEN_SWAY_M
+        if found.legs_shown[i]:
+            found.residual[i, LEGS] = _sway_of(sway_m[i] + _SWAY_RISES_M_PER_S * found.late_s[i, LEGS])
         if not np.isnan(unknown_m):
             found.legs_m[i] = residual_m[i, LEGS]
             found.legs_off_m[i] = unknown_m if found.legs_new[i] else 0.0

@@ -46,12 +46,12 @@ def people(count: int, seed: int) -> HumanStates:
     return replace(states, points_m=points, camera_points_m=cameras, residual_m=residual, legs_sway_m=sway)
 
 
-def residual_of(states: HumanStates, tick: int, limb: str) -> float:
-    """What the departures of a limb are multiples of: of shown legs their sway [m]."""
+def residual_of(states: HumanStates, tick: int, limb: str, late_s: float = 0.0) -> float:
+    """What the departures of a limb are multiples of: of shown legs their sway, which rises when it is not seen [m]."""
     if limb != "LEGS":
         return float(states.residual_m[tick, BODY.index(limb)])
     assert states.legs_sway_m is not None
-    return float(np.clip(states.legs_sway_m[tick], 0.008, 0.03))
+    return float(np.clip(states.legs_sway_m[tick] + 5.0 * 0.025 * late_s, 0.008, 0.03))
 
 
 def velocities(states: HumanStates, tick: int) -> dict[str, Floats]:
@@ -339,22 +339,21 @@ def test_somebody_whose_torso_went_out_of_sight_may_have_walked_on(unseen_s: flo
     for tick in range(3):
         for k, limb in enumerate(BODY):
             speed = speed_of(states, tick, limb)
-            residual = residual_of(states, tick, limb)
-            here, later = (
-                allowed_m(departure, limb, h, residual, speed) for h in (0.05, 0.05 + max(0.0, unseen_s - 0.1))
-            )
+            late_s = max(0.0, unseen_s - 0.1)
+            residual = residual_of(states, tick, limb, late_s)
+            here, later = (allowed_m(departure, limb, h, residual, speed) for h in (0.05, 0.05 + late_s))
             walked = (2.0 if limb in LIMBS[2:] else 1.6) * (unseen_s - 0.1)
             assert late.radius_m[tick, k] == pytest.approx(FLESH_M[limb] + max(later, here + walked), abs=2e-9)
 
 
-def test_legs_that_were_hidden_just_now_may_have_departed_for_longer() -> None:
+def test_legs_that_were_hidden_just_now_may_have_departed_for_longer_and_begun_to_move() -> None:
     states = people(3, seed=7)
     unseen, k = states.unseen_s.copy(), BODY.index("LEGS")
     unseen[:, k] = 0.18
     late = predict(replace(states, unseen_s=unseen), PEOPLE, Prediction(), horizon_s=0.1, memory_s=MEMORY_S)
     assert PEOPLE.departure is not None
     for tick in range(3):
-        sway, speed = residual_of(states, tick, "LEGS"), speed_of(states, tick, "LEGS")
+        sway, speed = residual_of(states, tick, "LEGS", 0.08), speed_of(states, tick, "LEGS")
         reach = allowed_m(PEOPLE.departure, "LEGS", 0.18, sway, speed)
         assert late.radius_m[tick, k] == pytest.approx(FLESH_M["LEGS"] + reach, abs=2e-9)
 
