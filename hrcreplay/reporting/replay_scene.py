@@ -545,10 +545,13 @@ def _stops(
     def driven(name: str) -> Floats:
         return np.concatenate([table[name].to_numpy(dtype=float) for table in tables])
 
-    s_s, first = np.unique(driven("programme_s"), return_index=True)
-    rate = np.gradient(numeric_column(motion, "programme_s"), times(motion) * 1e-9)
     row, _ = _rows(motion, t_ns)
-    at_s = numeric_column(motion, "programme_s")[row] + 0.5 * rate[row] * tau_s
+    rate = np.gradient(numeric_column(motion, "programme_s"), times(motion) * 1e-9)[row]
+    at_s = numeric_column(motion, "programme_s")[row] + 0.5 * rate * tau_s
+    s_s, first = np.unique(driven("programme_s"), return_index=True)
+    beside = np.searchsorted(s_s, at_s)[:, None] - [1, 0]  # few of a long run
+    beside = np.unique(np.clip(beside, 0, len(s_s) - 1))
+    s_s, first = s_s[beside], first[beside]
     return np.column_stack([np.interp(at_s, s_s, driven(f"q{i}")[first]) for i in range(1, robot.nv + 1)])
 
 
