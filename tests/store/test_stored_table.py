@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -153,6 +154,30 @@ def test_tables_of_one_file_share_it_and_one_written_anew_is_read_anew(tmp_path:
     path.unlink()
     pq.write_table(pa.table({"t_ns": np.arange(7)}), path)
     assert StoredTable(path)["t_ns"].tolist() == list(range(7)) != before
+
+
+def test_tables_read_in_turn_are_each_their_own(tables: tuple[StoredTable, pd.DataFrame], tmp_path: Path) -> None:
+    """Only the description of the file that was read last is kept; groups of rows of the two differ."""
+    stored, frame = tables
+    other = frame.iloc[::-1].reset_index(drop=True)
+    pq.write_table(pa.Table.from_pandas(other, preserve_index=False), tmp_path / "other.parquet", row_group_size=100)
+    reverse, few = StoredTable(tmp_path / "other.parquet"), np.arange(N) % 200 == 7
+    for _ in range(2):
+        same(stored[few], frame[few])
+        same(reverse[few], other[few])
+
+
+def test_a_table_of_some_rows_takes_a_bit_a_row(tables: tuple[StoredTable, pd.DataFrame]) -> None:
+    """In a long run with many visitors each of them has such tables."""
+    stored, frame = tables
+    kept = [stored[frame["person"].to_numpy() == 1] for _ in range(100)]
+    gc.collect()
+    tracemalloc.start()
+    kept += [stored[frame["person"].to_numpy() == 2] for _ in range(100)]
+    taken, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(kept[-1]) == (frame["person"] == 2).sum()
+    assert taken < 100 * N
 
 
 def test_columns_of_numbers_are_those_of_the_table(tables: tuple[StoredTable, pd.DataFrame]) -> None:
