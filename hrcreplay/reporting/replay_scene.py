@@ -26,6 +26,7 @@ from hrcreplay.robot.control.static_obstacles import StaticHull
 from hrcreplay.robot.irb140_shape import Solid
 from hrcreplay.robot.model import RobotModel, Segment
 from hrcreplay.settings.sections import setting
+from hrcreplay.store.memory import release_freed_memory
 from hrcreplay.store.run_folder import Run
 from hrcreplay.store.stored_table import RunTable, number_columns, text_column
 
@@ -486,6 +487,7 @@ def _track(
         t0_ns: Instant of time zero [ns].
         slow: A TCP slower than this counts as stationary [m/s].
     """
+    release_freed_memory()
     contact = None if run.contact is None else run.contact[run.contact["method"] == method]
     axes = range(1, robot.nv + 1)
     q, dq = (_pick(motion, [f"{kind}{i}" for i in axes], t_ns) for kind in ("q", "dq"))

@@ -19,6 +19,7 @@ from hrcreplay.reporting.metrics.fusion import cameras
 from hrcreplay.reporting.metrics.people import named_volumes
 from hrcreplay.reporting.metrics.series import Metric, find_known_ticks, instants, moment_ns, start_ns
 from hrcreplay.settings.sections import Logs, setting
+from hrcreplay.store.memory import release_freed_memory
 from hrcreplay.store.run_folder import Run
 from hrcreplay.store.stored_table import RunTable
 
@@ -396,6 +397,7 @@ def draw_all(
             continue
         with drawing.style(column=True):
             drawing.save(kind.draw(data), folder, file_name(kind, number), drawing.COLUMN_DPI, pdf=pdf)
+        release_freed_memory()
         names.append(file_name(kind, number))
     return tuple(names)
 

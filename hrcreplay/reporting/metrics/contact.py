@@ -372,11 +372,11 @@ def _stops(motion: RunTable, t0_ns: int, slow: float) -> list[StopEvent]:
     moving = is_moving(motion, slow)
     braking = text_column(motion, "status") == "braking"
     speed, distance = (numeric_column(motion, name) for name in ("tcp_speed", "distance_m"))
-    stopping, names = braking & moving, _names(motion)
+    stopping, names, moves = braking & moving, _names(motion), np.flatnonzero(moving)
     found = []
     for first, last in merged_runs(stopping, t_ns):
-        goes_on = np.flatnonzero(moving[last:])
-        again = last + int(goes_on[0]) if len(goes_on) else len(t_ns)
+        goes_on = int(np.searchsorted(moves, last))
+        again = int(moves[goes_on]) if goes_on < len(moves) else len(t_ns)
         found.append(
             StopEvent(
                 kind="stop",
