@@ -145,6 +145,7 @@ def _judge(judged: _JudgedRun, log: Log, writer: RunWriter, second: Executor | N
         if path.stem == f"motion_{RECORDED}" and StoredTable(path)["q1"].isna().all():
             capsules, _ = assembly.recorded_capsules(log, judged.T_world_base)
         meetings[path] = judged.judge(path, capsules, coverages)
+    release_freed_memory()
     for path in paths:
         writer.table("severity", meetings[path] if path in meetings else there[path].result())
         _move_rows(judged.rows_of(path), writer)
