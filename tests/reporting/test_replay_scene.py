@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.interpolate import interp1d
 from scipy.linalg import expm
 
 from hrcreplay.human.model import skeleton
@@ -109,6 +110,19 @@ def test_a_stop_on_the_path_stays_on_it(scene: ReplayScene) -> None:
     np.testing.assert_allclose(scene.methods["scaling"].stop_q[20], joints(np.array([clock_s]))[0][0], atol=2e-3)
 
 
+def test_every_stop_on_the_path_ends_between_the_driven_joints_beside_it(scene: ReplayScene) -> None:
+    """Held against scipy's interpolation over all that was driven."""
+    table = frame_of(moving_run(8.0).baselines["scaling"])
+    driven = table.drop_duplicates("programme_s").sort_values("programme_s")
+    every = interp1d(driven["programme_s"], driven[[f"q{i}" for i in range(1, 7)]], axis=0)
+    s_s = table["programme_s"].to_numpy()
+    rows = np.searchsorted(table["t_ns"].to_numpy(), scene.t_ns, side="right") - 1
+    ends_s = s_s[rows] + np.gradient(s_s, table["t_ns"].to_numpy() * 1e-9)[rows] * 0.1
+    within = ends_s <= s_s[-1]
+    assert within.sum() > 150
+    np.testing.assert_allclose(scene.methods["scaling"].stop_q[within], every(ends_s[within]), atol=1e-9)
+
+
 def test_the_list_of_stops_has_each_once() -> None:
     run = moving_run(8.0)
     assert run.motion is not None
@@ -129,6 +143,9 @@ def test_the_list_of_stops_has_each_once() -> None:
     assert (first.at_s, first.moving_s, first.rest_s) == pytest.approx((2.0, 0.45, 0.6))
     assert (first.speed_m_per_s, first.distance_m) == pytest.approx((0.4, 0.3))
     assert (second.at_s, second.moving_s, second.rest_s) == pytest.approx((6.0, 0.1, 0.0))
+    for_good = motion.assign(**{name: np.where(t_s >= 6.1, 0.0, motion[name]) for name in (*dq, "tcp_speed")})
+    *_, last = stop_events(for_good, None, T0_NS, 0.001)
+    assert (last.at_s, last.moving_s, last.rest_s) == pytest.approx((6.0, 0.1, t_s[-1] + 0.01 - 6.1))
     (touch,) = stop_events(
         motion.assign(status="tracking"), run.contact[run.contact["method"] == "scaling"], T0_NS, 0.001
     )
