@@ -158,7 +158,7 @@ class Table:
         return {name: value for name, value in vars(self).items() if isinstance(value, np.ndarray)}
 
     def __len__(self) -> int:
-        return len(next(iter(self._arrays().values())))
+        return next(len(value) for value in vars(self).values() if isinstance(value, np.ndarray))
 
     def rows(self, which: slice | Ints | Bools) -> Self:
         """The table with only the rows that ``which`` selects."""

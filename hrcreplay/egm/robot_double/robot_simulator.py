@@ -148,7 +148,7 @@ class _Rows:
     def append(self, row: tuple[Any, ...]) -> None:
         if self._used == _BLOCK:
             self._full.append(self._block)
-            self._block, self._used = np.zeros_like(self._block), 0
+            self._block, self._used = np.zeros(_BLOCK, self._block.dtype), 0  # zeros_like takes milliseconds
         self._block[self._used] = row
         self._used += 1
 
