@@ -97,7 +97,7 @@ class PersonFuser:
         )
         person = np.zeros(len(bodies), np.int64)
         person[bodies] = numbers
-        measured = seen.measured.rows(numbers > 0)
+        measured = seen.measured if (numbers > 0).all() else seen.measured.rows(numbers > 0)
         if (numbers > 1).any():
             measured = replace(measured, person=numbers[numbers > 0])
         return seen._replace(measured=measured, person=person), FusedTicks(states, counts, trace)

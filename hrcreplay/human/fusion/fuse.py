@@ -204,8 +204,8 @@ def _count_events(track: Track, cameras: Sequence[str]) -> Counter[str]:
     for c, camera in enumerate(cameras):
         counts[f"outlier_points_{camera}"] = int(track.outliers[c])
         counts[f"superseded_frames_{camera}"] = int(track.superseded[c])
-        for k in np.flatnonzero(track.disbelieved[c]):
-            counts[f"disbelieved_{POINTS[k]}_{camera}"] = int(track.disbelieved[c, k])
+    for c, k in np.argwhere(track.disbelieved).tolist():
+        counts[f"disbelieved_{POINTS[k]}_{cameras[c]}"] = int(track.disbelieved[c, k])
     return counts
 
 

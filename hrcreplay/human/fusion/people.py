@@ -38,6 +38,8 @@ APART_M, APART_S = 0.5, 0.1
 WALKS_ON_S, WALKS_M_PER_S = 1.0, 2.0
 #: Cost of an assignment that is not allowed, and of one to a person unseen for the memory [m].
 _NEVER, _LAST = 1e6, 1e3
+#: (2, 20) all points, and those of the other side.
+_ORDERS = np.array([range(len(POINTS)), MIRROR])
 _TORSO = np.array([POINTS.index(name) for name in POINTS if name.startswith(("pelvis", "chest", "neck", "sho", "hip"))])
 
 
@@ -101,6 +103,8 @@ class Seen(NamedTuple):
 
     def ticks(self) -> list[int]:
         """Ticks of new frames."""
+        if not len(self.bodies):
+            return []
         return [int(k) for k in np.flatnonzero(np.diff(self.until, prepend=0))]
 
 
@@ -208,8 +212,9 @@ def _follow_alone(
             return None
         state = state._replace(tracked=(_move_on(state.tracked[0], states, begin, end, seen=True),))
     state = state._replace(tracked=(replace(state.tracked[0], filter=after),))
-    person = None if one.number == 1 else np.full(len(states), one.number)
-    return Followed(state, numbers, replace(states, person=person), +counts, trace)
+    if one.number != 1:
+        states = replace(states, person=np.full(len(states), one.number))
+    return Followed(state, numbers, states, +counts, trace)
 
 
 def _move_on(one: Tracked, states: HumanStates, begin: int, end: int, *, seen: bool) -> Tracked:
@@ -382,13 +387,11 @@ def _apart(points_m: Floats, expected_m: Floats, otherwise_m: Floats) -> Floats:
 
     ``otherwise_m`` (b,) is for bodies without a common point.
     """
-    ways = []
-    for order in (list(range(len(POINTS))), list(MIRROR)):
-        off = np.linalg.norm(points_m[:, order] - expected_m, axis=2)
-        known = np.isfinite(off)
-        total, count = np.where(known, off, 0.0).sum(axis=1), known.sum(axis=1)
-        ways.append(np.where(count > 0, total / np.maximum(count, 1), otherwise_m))
-    return np.asarray(np.minimum(*ways))
+    off = np.linalg.norm(points_m[:, _ORDERS] - expected_m, axis=3)
+    known = np.isfinite(off)
+    total, count = np.where(known, off, 0.0).sum(axis=2), known.sum(axis=2)
+    ways = np.where(count > 0, total / np.maximum(count, 1), otherwise_m[:, None])
+    return np.asarray(ways.min(axis=1))
 
 
 def _is_shown_by_another(one: Tracked, camera: int, capture_ns: int) -> bool:
