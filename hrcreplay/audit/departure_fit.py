@@ -22,7 +22,7 @@ from scipy.sparse import coo_array, eye_array, hstack
 
 from hrcreplay.audit.departures import EXACT, LimbDepartures
 from hrcreplay.human.model import Departure
-from hrcreplay.human.prediction.velocity_tube import NOISE_M
+from hrcreplay.human.prediction.velocity_tube import LEGS_BEGIN_M_PER_S2, NOISE_M
 from hrcreplay.records import BODY, Bools, Floats
 
 #: Limbs that share a line: both sides of the body.
@@ -37,9 +37,6 @@ _RISEN, _LATE_S = 0.995, 0.05
 #: Maximum multiple of the residual of each pair; a larger one comes from the few logs with much noise. The residual of
 #: legs is their sway, a motion, of which a departure is several times as large.
 _STEEPEST = (1.0, 1.0, 1.0, 1.0, 8.0)
-#: Acceleration with which legs at rest begin to move: their lines are at least as high as it takes them. Large enough
-#: for simulated people who get up in 0.6 s (``tests/human/rising.py``) [m/s^2].
-_BEGINS_M_PER_S2 = 5.0
 #: Maximum slope over the speed: the time for which a limb's tube does not carry it, and for the filter's lag [s].
 _SWINGS_S = 0.3
 #: Maximum departure, as a multiple of the line, for which an offset is raised; larger ones come from the few ticks at
@@ -90,7 +87,7 @@ def _lines(samples: Sequence[LimbDepartures], horizon_s: Floats, rise_m: Floats,
 def _begun(departure: Departure) -> Departure:
     """Raises the legs' lines to those of legs that begin to move, but not above that of the longest horizon."""
     beyond_m, last = departure.beyond_m.copy(), departure.beyond_m[_LEGS, -1]
-    begun_m = np.minimum(0.5 * _BEGINS_M_PER_S2 * departure.horizon_s**2, last)
+    begun_m = np.minimum(0.5 * LEGS_BEGIN_M_PER_S2 * departure.horizon_s**2, last)
     beyond_m[_LEGS] = np.maximum(beyond_m[_LEGS], begun_m)
     return replace(departure, beyond_m=beyond_m)
 

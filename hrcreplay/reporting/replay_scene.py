@@ -487,7 +487,7 @@ def _track(
         t0_ns: Instant of time zero [ns].
         slow: A TCP slower than this counts as stationary [m/s].
     """
-    release_freed_memory()
+    release_freed_memory()  # what reading the volumes, or the motion before, took
     contact = None if run.contact is None else run.contact[run.contact["method"] == method]
     axes = range(1, robot.nv + 1)
     q, dq = (_pick(motion, [f"{kind}{i}" for i in axes], t_ns) for kind in ("q", "dq"))

@@ -51,9 +51,11 @@ _LEGS_AGE_S = 0.07
 #: Sway of legs, ``HumanStates.legs_sway_m``, that counts at least; that counts at most, as of people who walk, whose
 #: legs a tracker throws, or whose sway is not known; and of legs out of sight, as of somebody on one spot [m].
 _LEAST_SWAY_M, _MOST_SWAY_M, _HIDDEN_SWAY_M = 0.008, 0.03, 0.018
-#: How fast the sway of legs rises that begin to move when no camera shows them any more: an acceleration of 5 m/s^2
-#: times the 25 ms of a sway [m/s].
-_SWAY_RISES_M_PER_S = 0.125
+#: Acceleration with which legs at rest begin to move; large enough for simulated people who get up in 0.6 s
+#: (``tests/human/rising.py``) [m/s^2].
+LEGS_BEGIN_M_PER_S2 = 5.0
+#: How fast the sway of legs may rise while no camera shows them: by that acceleration, over the 25 ms of a sway [m/s].
+_SWAY_RISES_M_PER_S = LEGS_BEGIN_M_PER_S2 * 0.025
 #: Maximum rise, and sink, of an arm's hull [m].
 _ARMS_RISE_M = 0.06
 #: Minimum distance of a hand from its wrist that gives a direction [m].
