@@ -246,6 +246,24 @@ def test_exchanged_sides_do_not_make_another_person() -> None:
     assert (np.sort(found.numbers.reshape(-1, 2), axis=1) == [1, 2]).all()
 
 
+def test_how_far_bodies_are_apart_is_the_mean_of_their_common_points_either_side_being_left() -> None:
+    rng = np.random.default_rng(6)
+    expected_m, points_m = rng.normal(size=(20, 3)), rng.normal(size=(4, 20, 3))
+    points_m[1] = expected_m[list(MIRROR)] + [0.3, 0.0, 0.4]  # the sides exchanged
+    points_m[2, 5:] = np.nan
+    expected_m[2] = points_m[3] = np.nan
+    found = people._apart(points_m, expected_m, np.array([7.0, 8.0, 9.0, 10.0]))
+    for body, points in enumerate(points_m):
+        means = []
+        for order in (range(20), MIRROR):
+            far = [np.sqrt(((points[i] - expected_m[k]) ** 2).sum()) for k, i in enumerate(order)]
+            known = [one for one in far if np.isfinite(one)]
+            means.append(sum(known) / len(known) if known else 7.0 + body)
+        assert found[body] == pytest.approx(min(means))
+    assert found[1] == pytest.approx(0.5)
+    assert found[3] == 10.0
+
+
 def test_a_body_that_jumps_is_another_until_the_first_is_forgotten() -> None:
     frames = Frames()
     frames.every(0, 1000, 0, at(1.5))
