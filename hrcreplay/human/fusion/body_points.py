@@ -185,7 +185,7 @@ def _sway(model: ModelResidual, c: int, n: int, from_below: Floats, capture_ns: 
     model.sway_from[c, n], model.sway_ns[c, n] = from_below, capture_ns
 
 
-@njit(cache=True, inner=True)
+@njit(inner=True, inline="always")  # passing the filter on would take longer than this
 def legs_sway(model: ModelResidual, now: int) -> float:
     """Root mean square of the recent ways of the legs' points that cameras show; NaN if none does [m]."""
     total, count = 0.0, 0
@@ -258,7 +258,7 @@ def distance_shown(point: Floats, start: Floats, along: Floats) -> float:
     return distance(point, nearest)
 
 
-@njit(cache=True, inner=True)
+@njit(inner=True, inline="always")  # passing the filter on would take longer than this
 def place(estimate: StateEstimate, model: ModelResidual, points: Floats, camera_points: Floats) -> None:
     """Writes the points at the tick; NaN for hands and legs that no camera has observed recently.
 

@@ -129,7 +129,7 @@ def start(cameras: tuple[str, ...]) -> FusionState:
     )
 
 
-def _copy(state: FusionState) -> FusionState:
+def copied(state: FusionState) -> FusionState:
     """The same numbers in arrays of their own."""
     estimate, gate, model = ([array.copy() for array in part] for part in state)
     return Filter(StateEstimate._make(estimate), Gate._make(gate), ModelResidual._make(model))
@@ -171,13 +171,28 @@ def fuse(
         trace of the n ticks, which has no rows unless ``traced``. The bits of the states do not depend on the division
         of ticks into calls.
     """
-    after = _copy(state)
-    track = _track(len(ticks_ns), len(measurements.cameras), traced=traced)
-    run(np.array(ticks_ns), _frames(measurements), after, _rules(settings, limits), track)
-    p, v, a, j, p_std, v_std = track.motion
-    lengths, lengths_std = track.lengths
+    after = copied(state)
+    track = empty_track(len(ticks_ns), len(measurements.cameras), traced=traced)
+    run(np.array(ticks_ns), as_frames(measurements), after, as_rules(settings, limits), track)
+    return after, *written(track, len(ticks_ns), ticks_ns, None, measurements.cameras)
+
+
+def written(
+    track: Track, n: int, t_ns: Ints, person: Ints | None, cameras: tuple[str, ...]
+) -> tuple[HumanStates, Counter[str], Trace]:
+    """What the kernel has written: the first ``n`` rows as states, the counts of events, and the trace.
+
+    Args:
+        track: After the ticks.
+        n: Number of rows written.
+        t_ns: (n,) instants of the rows.
+        person: (n,) numbers of their people; None: person 1.
+        cameras: Names of the cameras.
+    """
+    p, v, a, j, p_std, v_std = track.motion[:, :n]
+    lengths, lengths_std = track.lengths[:, :n]
     states = HumanStates(
-        t_ns=ticks_ns,
+        t_ns=t_ns,
         p=p,
         v=v,
         a=a,
@@ -186,17 +201,18 @@ def fuse(
         v_std=v_std,
         lengths_m=lengths,
         lengths_std_m=lengths_std,
-        valid=track.valid,
-        residual_m=track.residual,
-        unseen_s=track.unseen,
-        frame_age_s=track.frame_age,
-        points_m=track.points,
-        cameras=measurements.cameras,
-        camera_points_m=track.camera_points,
-        legs_sway_m=track.legs_sway,
+        valid=track.valid[:n],
+        residual_m=track.residual[:n],
+        unseen_s=track.unseen[:n],
+        frame_age_s=track.frame_age[:n],
+        points_m=track.points[:n],
+        cameras=cameras,
+        camera_points_m=track.camera_points[:n],
+        legs_sway_m=track.legs_sway[:n],
+        person=person,
     )
-    trace = Trace(track.cov, track.damping, track.spread, track.autocorrelation)
-    return after, states, _count_events(track, measurements.cameras), trace
+    trace = Trace(track.cov[:n], track.damping[:n], track.spread[:n], track.autocorrelation[:n])
+    return states, _count_events(track, cameras), trace
 
 
 def _count_events(track: Track, cameras: Sequence[str]) -> Counter[str]:
@@ -229,7 +245,7 @@ def _sigma(settings: Fusion) -> Floats:
     return np.array((settings.sigma_position, settings.sigma_angle, settings.sigma_height))[_KIND]
 
 
-def _frames(measurements: Measurements) -> Frames:
+def as_frames(measurements: Measurements) -> Frames:
     """Copies the measurements into the kernel's form, as the arrays of a record are read-only."""
     return Frames(
         capture_ns=np.array(measurements.capture_ns),
@@ -242,7 +258,8 @@ def _frames(measurements: Measurements) -> Frames:
     )
 
 
-def _rules(settings: Fusion, limits: LimitSet) -> Rules:
+def as_rules(settings: Fusion, limits: LimitSet) -> Rules:
+    """The settings and limits as the kernel needs them."""
     return Rules(
         sigma=_sigma(settings),
         reuse=settings.stale == "reuse",
@@ -274,22 +291,23 @@ def _rules(settings: Fusion, limits: LimitSet) -> Rules:
     )
 
 
-def _track(n: int, cameras: int, *, traced: bool) -> Track:
+def empty_track(n: int, cameras: int, *, traced: bool) -> Track:
+    """Makes the arrays for ``n`` rows, whose content is not defined until the kernel writes it, and counts of 0."""
     rows = n if traced else 0
     return Track(
-        motion=np.full((6, n, DOF), np.nan),
-        lengths=np.full((2, n, len(LENGTHS)), np.nan),
-        valid=np.zeros((n, cameras), dtype=np.bool_),
-        residual=np.full((n, len(BODY)), np.nan),
-        unseen=np.full((n, len(BODY)), np.inf),
-        frame_age=np.full(n, np.inf),
-        points=np.full((n, len(POINTS), 3), np.nan),
-        camera_points=np.full((n, cameras, len(POINTS), 3), np.nan),
-        legs_sway=np.full(n, np.nan),
-        cov=np.full((rows, DOF, 4, 4), np.nan),
-        damping=np.ones((rows, DOF)),
-        spread=np.full((rows, DOF), np.nan),
-        autocorrelation=np.full((rows, DOF), np.nan),
+        motion=np.empty((6, n, DOF)),
+        lengths=np.empty((2, n, len(LENGTHS))),
+        valid=np.empty((n, cameras), dtype=np.bool_),
+        residual=np.empty((n, len(BODY))),
+        unseen=np.empty((n, len(BODY))),
+        frame_age=np.empty(n),
+        points=np.empty((n, len(POINTS), 3)),
+        camera_points=np.empty((n, cameras, len(POINTS), 3)),
+        legs_sway=np.empty(n),
+        cov=np.empty((rows, DOF, 4, 4)),
+        damping=np.empty((rows, DOF)),
+        spread=np.empty((rows, DOF)),
+        autocorrelation=np.empty((rows, DOF)),
         outliers=np.zeros(cameras, dtype=np.int64),
         disbelieved=np.zeros((cameras, len(POINTS)), dtype=np.int64),
         superseded=np.zeros(cameras, dtype=np.int64),

@@ -135,7 +135,7 @@ class Rules(NamedTuple):
 
 
 class Track(NamedTuple):
-    """Output of the ticks; rows before the start are not changed."""
+    """Output of the ticks: n rows, and the counts of events."""
 
     motion: Floats  #: (6, n, 13) p, v, a, j, and the reported deviations of p and v
     lengths: Floats  #: (2, n, 7) and their deviations
@@ -155,6 +155,32 @@ class Track(NamedTuple):
     superseded: Ints  #: (c,)
     reacquired: Ints  #: (1,)
     saturated: Ints  #: (1,)
+
+
+@njit(inner=True, inline="always")  # passing the filter on would take longer than this
+def one_of(filters: Filter, k: int) -> Filter:
+    """The filter of one person, of filters whose arrays have one more axis, that of the people, before all others."""
+    estimate, gate, model = filters
+    # fmt: off
+    return Filter(
+        StateEstimate(
+            estimate.tick_ns[k], estimate.started[k], estimate.mean[k], estimate.cov[k], estimate.lengths[k],
+            estimate.lengths_var[k], estimate.row_ns[k], estimate.acquired_ns[k], estimate.bone_ns[k],
+            estimate.innovation[k], estimate.squares[k], estimate.products[k], estimate.spread[k],
+        ),
+        Gate(
+            gate.point_ns[k], gate.refused_ns[k], gate.refused_at[k], gate.apart[k], gate.capture_ns[k],
+            gate.uses[k], gate.newest_ns[k], gate.z[k], gate.z_var[k], gate.points[k], gate.confidence[k],
+            gate.valid[k], gate.shows[k], gate.trusted[k], gate.wrong[k], gate.judged_ns[k], gate.disbelieved[k],
+        ),
+        ModelResidual(
+            model.residuals[k], model.weight[k], model.samples[k], model.sampled_ns[k], model.residual[k],
+            model.peak[k], model.peak_ns[k], model.offset[k], model.offset_weight[k], model.offset_ns[k],
+            model.carried[k], model.carried_ns[k], model.leg_bones[k], model.leg_bones_seen[k],
+            model.leg_bones_ns[k], model.sway[k], model.sway_from[k], model.sway_ns[k], model.foot[k],
+        ),
+    )
+    # fmt: on
 
 
 @njit(cache=True, inner=True)

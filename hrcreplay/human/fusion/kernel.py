@@ -38,8 +38,6 @@ _NAME_MARGIN = np.radians(20.0)
 def run(ticks_ns: Ints, frames: Frames, filter_: Filter, rules: Rules, track: Track) -> None:
     """Runs Alg. 3 over the ticks, changing the filter in place. Frames must have arrived by the last tick.
 
-    Without a valid row the a-priori estimate stays as it is, Eq. (50), (51).
-
     Args:
         ticks_ns: (n,) instants.
         frames: In order of arrival.
@@ -47,30 +45,57 @@ def run(ticks_ns: Ints, frames: Frames, filter_: Filter, rules: Rules, track: Tr
         rules: Settings and limits.
         track: Arrays for n ticks; receive the states and the counts of events.
     """
-    damping = np.ones(DOF)
-    seen = np.int64(0)  # numba would compile `_collect` once more for the constant 0
+    row = 0
     for k in range(len(ticks_ns)):
-        now = ticks_ns[k]
-        dt = (now - filter_.estimate.tick_ns[0]) * 1e-9 if filter_.estimate.started[0] else 0.0
-        if filter_.estimate.started[0]:
-            _predict(filter_.estimate, now, rules, damping)
-        seen = _collect(frames, seen, now, filter_.gate, track.superseded)
-        fresh = filter_.gate.uses == 0
-        for c in range(len(fresh)):
-            if fresh[c]:
-                validate_frame(filter_, c, now, rules, track.outliers, track.disbelieved[c])
-        if filter_.estimate.started[0]:
-            observe(filter_, fresh, now, rules, track.outliers)
-        for c in range(len(fresh)):
-            again = rules.reuse and filter_.gate.uses[c] > 0 and now - filter_.gate.capture_ns[c] <= rules.memory_ns
-            if fresh[c] or again:
-                track.valid[k, c] = _update(filter_, c, now, rules, track)
-        filter_.estimate.tick_ns[0] = now
-        if filter_.estimate.started[0]:
-            _rename(filter_.estimate.mean)
-            if saturate(filter_.estimate.mean, dt, rules):
-                track.saturated[0] += 1
-            _leave(filter_, k, rules, track, damping)
+        while row < len(frames.arrival_ns) and frames.arrival_ns[row] <= ticks_ns[k]:
+            store(frames, row, filter_.gate, track.superseded)
+            row += 1
+        step(filter_, ticks_ns[k], rules, track, k)
+
+
+@njit(inner=True, inline="always")  # passing the filter on would take longer than this
+def step(filter_: Filter, now: int, rules: Rules, track: Track, k: int) -> None:
+    """Runs one tick of Alg. 3 with the frames stored since the last one, and writes row ``k`` of the track.
+
+    Without a valid row the a-priori estimate stays as it is, Eq. (50), (51).
+    """
+    write_unknown(track, k)
+    track.camera_points[k] = np.nan
+    damping = np.ones(DOF)
+    dt = (now - filter_.estimate.tick_ns[0]) * 1e-9 if filter_.estimate.started[0] else 0.0
+    if filter_.estimate.started[0]:
+        _predict(filter_.estimate, now, rules, damping)
+    fresh = filter_.gate.uses == 0
+    for c in range(len(fresh)):
+        if fresh[c]:
+            validate_frame(filter_, c, now, rules, track.outliers, track.disbelieved[c])
+    if filter_.estimate.started[0] and fresh.any():
+        observe(filter_, fresh, now, rules, track.outliers)
+    for c in range(len(fresh)):
+        again = rules.reuse and filter_.gate.uses[c] > 0 and now - filter_.gate.capture_ns[c] <= rules.memory_ns
+        if fresh[c] or again:
+            track.valid[k, c] = _update(filter_, c, now, rules, track)
+    filter_.estimate.tick_ns[0] = now
+    if filter_.estimate.started[0]:
+        _rename(filter_.estimate.mean)
+        if saturate(filter_.estimate.mean, dt, rules):
+            track.saturated[0] += 1
+        _leave(filter_, k, rules, track, damping)
+    elif len(track.cov) > 0:
+        track.cov[k], track.damping[k], track.spread[k], track.autocorrelation[k] = np.nan, 1.0, np.nan, np.nan
+
+
+@njit(cache=True, inner=True)
+def write_unknown(track: Track, k: int) -> None:
+    """Writes row ``k`` of a body whose joints are not known; its points as cameras show them stay as they are."""
+    track.motion[:, k] = np.nan
+    track.lengths[:, k] = np.nan
+    track.valid[k] = False
+    track.residual[k] = np.nan
+    track.unseen[k] = np.inf
+    track.frame_age[k] = np.inf
+    track.points[k] = np.nan
+    track.legs_sway[k] = np.nan
 
 
 @njit(inner=True, inline="always")  # passing the filter on would take longer than this
@@ -86,23 +111,20 @@ def _predict(estimate: StateEstimate, now: int, rules: Rules, damping: Floats) -
 
 
 @njit(cache=True, inner=True)
-def _collect(frames: Frames, seen: int, now: int, gate: Gate, superseded: Ints) -> int:
-    """Stores the newest arrived frame of each camera; returns the number of frames processed."""
-    while seen < len(frames.arrival_ns) and frames.arrival_ns[seen] <= now:
-        c = frames.camera[seen]
-        waiting = gate.uses[c] == 0
-        late = gate.uses[c] >= 0 and frames.capture_ns[seen] < gate.capture_ns[c]
-        if waiting or late:
-            superseded[c] += 1
-        if not late:
-            gate.capture_ns[c] = frames.capture_ns[seen]
-            gate.uses[c] = 0
-            gate.z[c] = frames.z[seen]
-            gate.z_var[c] = frames.z_var[seen]
-            gate.points[c] = frames.points[seen]
-            gate.confidence[c] = frames.confidence[seen]
-        seen += 1
-    return seen
+def store(frames: Frames, row: int, gate: Gate, superseded: Ints) -> None:
+    """Stores a frame that has arrived for the next tick, unless a newer one of the same camera has come before."""
+    c = frames.camera[row]
+    waiting = gate.uses[c] == 0
+    late = gate.uses[c] >= 0 and frames.capture_ns[row] < gate.capture_ns[c]
+    if waiting or late:
+        superseded[c] += 1
+    if not late:
+        gate.capture_ns[c] = frames.capture_ns[row]
+        gate.uses[c] = 0
+        gate.z[c] = frames.z[row]
+        gate.z_var[c] = frames.z_var[row]
+        gate.points[c] = frames.points[row]
+        gate.confidence[c] = frames.confidence[row]
 
 
 @njit(cache=True, inner=True)

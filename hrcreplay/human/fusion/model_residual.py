@@ -127,7 +127,7 @@ def _depart(gate: Gate, c: int, model: Floats, now: int, outlier_m: float) -> No
                 gate.apart[c, limb] = max(gate.apart[c, limb], distance(here, model[k]))
 
 
-@njit(cache=True, inner=True)
+@njit(inner=True, inline="always")  # passing the filter on would take longer than this
 def write_residual(model: ModelResidual, gate: Gate, now: int, rules: Rules, residual: Floats) -> None:
     """Writes the residual of each limb of BODY used at a tick, (7,) [m]; NaN until known.
 

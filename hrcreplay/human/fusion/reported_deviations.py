@@ -83,7 +83,7 @@ def autocorrelation(squares: float, products: float) -> float:
     return float(max(-1.0, min(products / squares, 1.0)))
 
 
-@njit(cache=True, inner=True)
+@njit(inner=True, inline="always")  # passing the filter on would take longer than this
 def write_deviations(estimate: StateEstimate, rules: Rules, deviations: Floats) -> None:
     """Writes the reported standard deviations of p and v of each joint, (2, 13) [m or rad, and these per s].
 

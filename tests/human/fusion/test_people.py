@@ -6,12 +6,13 @@ from collections import Counter
 from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
-from unittest import mock
 
 import numpy as np
 import pytest
+from scipy.optimize import linear_sum_assignment
 
-from hrcreplay.human.fusion import fuse, people
+from hrcreplay.human.fusion import fuse
+from hrcreplay.human.fusion.assignment import apart, least_sum
 from hrcreplay.human.fusion.inverse_kinematics import measure
 from hrcreplay.human.fusion.people import PeopleRules, PeopleState, follow, start
 from hrcreplay.human.model import skeleton
@@ -19,6 +20,7 @@ from hrcreplay.limits import load_limits
 from hrcreplay.records import MIRROR, CameraFrames, Floats, HumanStates, Ints, Measurements
 from hrcreplay.settings.sections import Fusion
 from tests import crowd
+from tests.human.fusion import tracked_one_by_one
 from tests.human.sightings import CAMERAS, LENGTHS_M, NEUTRAL
 
 MS = 1_000_000
@@ -34,7 +36,14 @@ class Found(NamedTuple):
     counts: Counter[str]
 
 
-def track(measured: Measurements, bodies: Ints, rules: PeopleRules, ticks_ns: Ints, batch: int = 10**9) -> Found:
+def track(
+    measured: Measurements,
+    bodies: Ints,
+    rules: PeopleRules,
+    ticks_ns: Ints,
+    batch: int = 10**9,
+    settings: Fusion = Fusion(),  # noqa: B008 (a constant)
+) -> Found:
     """Tracks all frames, so many ticks at a time."""
     names = tuple(measured.cameras)
     state: PeopleState = start(names)
@@ -44,7 +53,7 @@ def track(measured: Measurements, bodies: Ints, rules: PeopleRules, ticks_ns: In
         ticks = ticks_ns[first : first + batch]
         until = int(np.searchsorted(measured.arrival_ns, ticks[-1], side="right"))
         due = slice(before, until)
-        found = follow(state, ticks, measured.rows(due), bodies[due], rules, Fusion(), load_limits("human"))
+        found = follow(state, ticks, measured.rows(due), bodies[due], rules, settings, load_limits("human"))
         state, before = found.state, until
         parts.append(found.states)
         numbers.append(found.numbers)
@@ -113,15 +122,19 @@ class Frames:
         for at_ms in range(first_ms, last_ms, 33):
             self.add(at_ms, camera, *bodies)
 
-    def track(self, until_ms: int, rules: PeopleRules = STANDING, **how: int) -> Found:
-        """Everybody in them, at a tick every 4 ms."""
-        rows = sorted(self.rows, key=lambda row: row[0])
-        t_ns, camera, body = (np.array([row[i] for row in rows], dtype=np.int64) for i in range(3))
-        points = np.array([row[3] for row in rows])
+    def measured(self, late_ms: Ints | int = 0) -> tuple[Measurements, Ints]:
+        """All rows in order of arrival, which is 20 ms after the capture and so much later, and the ids."""
+        t_ns, camera, body = (np.array([row[i] for row in self.rows], dtype=np.int64) for i in range(3))
+        points = np.array([row[3] for row in self.rows])
         sure = np.isfinite(points[..., 0]).astype(float)
-        frames = CameraFrames(t_ns, t_ns + 20 * MS, camera, body, points, sure, CAMERAS)
-        measured = measure(frames, np.array([np.eye(4)] * 2), Fusion())
-        return track(measured, body, rules, np.arange(0, until_ms, 4) * MS, **how)
+        arrival_ns = t_ns + (20 + late_ms) * MS
+        frames = CameraFrames(t_ns, arrival_ns, camera, body, points, sure, CAMERAS)
+        order = np.argsort(arrival_ns, kind="stable")
+        return measure(frames.rows(order), np.array([np.eye(4)] * 2), Fusion()), body[order]
+
+    def track(self, until_ms: int, rules: PeopleRules = STANDING) -> Found:
+        """Everybody in them, at a tick every 4 ms."""
+        return track(*self.measured(), rules, np.arange(0, until_ms, 4) * MS)
 
 
 def test_one_body_gives_the_states_of_the_filter_alone() -> None:
@@ -137,27 +150,71 @@ def test_one_body_gives_the_states_of_the_filter_alone() -> None:
     assert +counts == Counter({name: n for name, n in found.counts.items() if name in counts})
 
 
-@pytest.mark.parametrize("jump", [False, True])
-def test_one_run_of_the_filter_has_the_bits_of_a_run_per_frame(jump: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    _, measured = crossing(1, "restart", swap_sides=False, until_s=3.0)
-    if jump:  # the person of the second half stands elsewhere: not one person all along
-        points = measured.points_m.copy()
-        points[len(points) // 2 :] += [3.0, 0.0, 0.0]
-        measured = replace(measured, points_m=points)
-    bodies, ticks_ns = np.ones(len(measured), np.int64), ticks_of(measured)
-    rules = PeopleRules(0.8, 2.0, POSES[:, :3, 3])
-    found = track(measured, bodies, rules, ticks_ns, batch=250)
-    with monkeypatch.context() as patch:
-        patch.setattr(people, "_follow_alone", lambda *_, **__: None)
-        expected = track(measured, bodies, rules, ticks_ns, batch=250)
-    with mock.patch.object(fuse, "fuse", wraps=fuse.fuse) as runs:
-        track(measured, bodies, rules, ticks_ns, batch=250)
-    assert (runs.call_count == -(-len(ticks_ns) // 250)) != jump  # one run a call, unless there is another person
-    assert found.counts == expected.counts
-    assert (found.numbers == expected.numbers).all()
+def assert_same(found: Found, expected: tracked_one_by_one.Found) -> None:
+    """Fails unless numbers and counts are the same, and all states have the same bits."""
+    assert found.numbers.tolist() == expected.numbers.tolist()
+    assert +found.counts == expected.counts
+    states = replace(found.states, person=found.states.numbers)
     for name, value in vars(expected.states).items():
-        same = getattr(found.states, name)
+        same = getattr(states, name)
         assert value.tobytes() == same.tobytes() if isinstance(value, np.ndarray) else value == same, name
+
+
+@pytest.mark.parametrize(("count", "swap_sides"), [(1, False), (3, True)])
+def test_people_are_followed_as_one_by_one(count: int, swap_sides: bool) -> None:
+    scene, measured = crossing(count, "swapped", swap_sides=swap_sides, until_s=4.0)
+    ticks, rules = ticks_of(measured, 20.0), PeopleRules(0.8, 2.0, POSES[:, :3, 3])
+    come = measured.arrival_ns <= ticks[-1]
+    measured, bodies = measured.rows(come), scene.frames.body[come]
+    expected = tracked_one_by_one.follow(ticks, measured, bodies, rules, Fusion(), load_limits("human"))
+    assert_same(track(measured, bodies, rules, ticks), expected)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_bodies_at_random_are_followed_as_one_by_one(seed: int) -> None:
+    """Bodies come, go, jump, are shown twice, without points, in two parts of a frame, late and in any order."""
+    rng = np.random.default_rng(seed)
+    frames, places = Frames(), rng.uniform([1.0, -1.5], [4.0, 1.5], (4, 2))
+    for at_ms in range(0, 3500, 33):
+        places += rng.normal(0.0, 0.02, places.shape)
+        places[rng.random(4) < 0.01] = rng.uniform(0.5, 4.0, 2)
+        for camera in range(2):
+            shown = [
+                at(*places[k]) + rng.normal(0.0, 0.03, (20, 3))
+                for k in range(4)
+                if rng.random() < (0.9, 0.6, 0.3, 0.1)[k]
+            ]
+            shown += [body + 0.05 for body in shown if rng.random() < 0.05]
+            for body in shown:
+                body[rng.random(20) < (1.0 if rng.random() < 0.03 else 0.1)] = np.nan
+            order = rng.permutation(len(shown))
+            cut = int(rng.integers(0, len(shown) + 1))
+            frames.add(at_ms + 10 * camera, camera, *(shown[k] for k in order[:cut]), first_id=int(rng.integers(1, 3)))
+            frames.add(at_ms + 10 * camera, camera, *(shown[k] for k in order[cut:]), first_id=5)
+    measured, bodies = frames.measured(rng.integers(0, 3, len(frames.rows)) * 20)
+    ticks, rules = np.arange(0, 4200, 12) * MS, PeopleRules(0.8, 0.5, np.zeros((2, 3)))
+    settings = Fusion(fresh_s=0.1)
+    expected = tracked_one_by_one.follow(ticks, measured, bodies, rules, settings, load_limits("human"))
+    assert len(set(expected.states.numbers.tolist())) > 3  # not a scene without events
+    assert (
+        min(expected.counts[name] for name in ("person_bodies_dropped", "bodies_seen_briefly", "person_id_switches"))
+        > 0
+    )
+    assert_same(track(measured, bodies, rules, ticks, settings=settings), expected)
+    assert_same(track(measured, bodies, rules, ticks, batch=5, settings=settings), expected)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_chosen_columns_have_the_smallest_sum(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    for _ in range(200):
+        n = int(rng.integers(1, 7))
+        cost = rng.random((n, n + int(rng.integers(0, 5))))
+        cost[rng.random(cost.shape) < 0.4] = 1e6  # not allowed
+        chosen = least_sum(cost)
+        assert len(set(chosen.tolist())) == n
+        rows, columns = linear_sum_assignment(cost)
+        assert cost[range(n), chosen].sum() == pytest.approx(cost[rows, columns].sum(), rel=1e-12)
 
 
 def test_one_person_before_two_cameras_is_one_person_and_a_body_shown_twice_too() -> None:
@@ -252,7 +309,7 @@ def test_how_far_bodies_are_apart_is_the_mean_of_their_common_points_either_side
     points_m[1] = expected_m[list(MIRROR)] + [0.3, 0.0, 0.4]  # the sides exchanged
     points_m[2, 5:] = np.nan
     expected_m[2] = points_m[3] = np.nan
-    found = people._apart(points_m, expected_m, np.array([7.0, 8.0, 9.0, 10.0]))
+    found = [apart(points, expected_m, 7.0 + body) for body, points in enumerate(points_m)]
     for body, points in enumerate(points_m):
         means = []
         for order in (range(20), MIRROR):
