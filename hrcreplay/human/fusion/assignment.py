@@ -28,7 +28,7 @@ APART_M, APART_S = 0.5, 0.1
 WALKS_ON_S, WALKS_M_PER_S = 1.0, 2.0
 #: Number of a slot that has not been used, and of one whose body or person was forgotten.
 FREE, GONE = 0, -1
-#: Counts of events, in the order of ``Bodies.counts``: bodies without a point or shown twice, frames that show nobody,
+#: Counts of events, in the order of ``ShownBodies.counts``: bodies without a point or shown twice, frames with nobody,
 #: changes of the tracker's id, bodies that were never a person.
 EVENTS = ("person_bodies_dropped", "person_frames_without", "person_id_switches", "bodies_seen_briefly")
 _DROPPED, _WITHOUT, _SWITCHES, _BRIEFLY = range(len(EVENTS))
@@ -39,7 +39,7 @@ _ORDERS = np.array([range(len(POINTS)), MIRROR])
 _IS_TORSO = np.array([name.startswith(("pelvis", "chest", "neck", "sho", "hip")) for name in POINTS])
 
 
-class Tracks(NamedTuple):
+class TrackedBodies(NamedTuple):
     """People, and bodies that may become people, one a slot."""
 
     number: Ints  #: (s,) from 1; ``FREE`` or ``GONE``: there is nobody
@@ -64,7 +64,7 @@ class TrackingRules(NamedTuple):
     fresh_s: float
 
 
-class Bodies(NamedTuple):
+class ShownBodies(NamedTuple):
     """All bodies of a call in order of arrival, and what the kernel finds out."""
 
     frames: Frames
@@ -74,7 +74,7 @@ class Bodies(NamedTuple):
     counts: Ints  #: (4,) EVENTS
 
 
-class Rows(NamedTuple):
+class StateRows(NamedTuple):
     """Rows of states, one per tick and person."""
 
     track: Track
@@ -85,13 +85,13 @@ class Rows(NamedTuple):
 @njit(cache=True)
 def follow_ticks(
     ticks_ns: Ints,
-    bodies: Bodies,
-    tracks: Tracks,
+    bodies: ShownBodies,
+    tracks: TrackedBodies,
     filters: Filter,
     spent: Bools,
     tracking: TrackingRules,
     rules: Rules,
-    rows: Rows,
+    rows: StateRows,
     done: Ints,
 ) -> int:
     """Follows everybody tick after tick, until the last or until slots or rows run out; changes the state in place.
@@ -136,7 +136,14 @@ def follow_ticks(
 
 @njit(cache=True, inner=True)
 def _write(
-    now: int, slot: int, kept: bool, numbers: Ints, tracks: Tracks, estimate: StateEstimate, rows: Rows, at: int
+    now: int,
+    slot: int,
+    kept: bool,
+    numbers: Ints,
+    tracks: TrackedBodies,
+    estimate: StateEstimate,
+    rows: StateRows,
+    at: int,
 ) -> int:
     """Completes row ``at`` after the tick of a slot's filter; returns the number of rows with it, which the last lacks.
 
@@ -155,7 +162,7 @@ def _write(
 
 
 @njit(cache=True, inner=True)
-def _kept(slots: Ints, tracks: Tracks, now: int, tracking: TrackingRules) -> Bools:
+def _kept(slots: Ints, tracks: TrackedBodies, now: int, tracking: TrackingRules) -> Bools:
     """(s,) true for people who are remembered, at least the last one, and for bodies that a camera has just shown."""
     kept, last, somebody = np.zeros(len(tracks.number), np.bool_), -1, False
     for slot in slots:
@@ -172,7 +179,7 @@ def _kept(slots: Ints, tracks: Tracks, now: int, tracking: TrackingRules) -> Boo
 
 
 @njit(cache=True, inner=True)
-def _forget(tracks: Tracks, kept: Bools, counts: Ints) -> None:
+def _forget(tracks: TrackedBodies, kept: Bools, counts: Ints) -> None:
     """Removes who is not there any more."""
     for slot in range(len(kept)):
         if tracks.number[slot] > FREE and not kept[slot]:
@@ -191,8 +198,8 @@ def _in_order(number: Ints) -> Ints:
 def _assign(
     row: int,
     last: int,
-    bodies: Bodies,
-    tracks: Tracks,
+    bodies: ShownBodies,
+    tracks: TrackedBodies,
     filters: Filter,
     spent: Bools,
     tracking: TrackingRules,
@@ -266,7 +273,7 @@ def _whose(
     row: int,
     points_m: Floats,
     places_m: Floats,
-    tracks: Tracks,
+    tracks: TrackedBodies,
     estimate: StateEstimate,
     tracking: TrackingRules,
 ) -> Ints:
@@ -293,7 +300,7 @@ def _cost(
     row: int,
     points_m: Floats,
     place_m: Floats,
-    tracks: Tracks,
+    tracks: TrackedBodies,
     slot: int,
     expected_m: Floats,
     walked_m: Floats,
@@ -318,7 +325,7 @@ def _cost(
 
 
 @njit(cache=True, inner=True)
-def _expected(tracks: Tracks, slot: int, estimate: StateEstimate, capture_ns: int) -> tuple[Floats, Floats]:
+def _expected(tracks: TrackedBodies, slot: int, estimate: StateEstimate, capture_ns: int) -> tuple[Floats, Floats]:
     """The points (20, 3) expected, of the fused skeleton, else those last shown; and the way (3,) there [m]."""
     walk, walked_m = tracks.walk[slot], np.zeros(3)
     if np.isnan(walk[0, 0]):
@@ -402,7 +409,7 @@ def _shown_twice(points_m: Floats, all_m: Floats, of_body: Ints) -> int:
 
 
 @njit(cache=True, inner=True)
-def _add(tracks: Tracks, spent: Bools, born_ns: int) -> int:
+def _add(tracks: TrackedBodies, spent: Bools, born_ns: int) -> int:
     """Gives a free slot to a body that belongs to nobody, with the smallest number that is neither spent nor used."""
     number = 1
     while spent[number - 1] or (tracks.number == number).any():
@@ -413,7 +420,7 @@ def _add(tracks: Tracks, spent: Bools, born_ns: int) -> int:
 
 
 @njit(cache=True, inner=True)
-def _see(tracks: Tracks, slot: int, bodies: Bodies, row: int, points_m: Floats, place_m: Floats) -> bool:
+def _see(tracks: TrackedBodies, slot: int, bodies: ShownBodies, row: int, points_m: Floats, place_m: Floats) -> bool:
     """Notes a frame that shows a person or body; returns True if the camera's id of it has changed."""
     camera, capture_ns = bodies.frames.camera[row], bodies.frames.capture_ns[row]
     switched = tracks.view_ns[slot, camera] != NEVER_NS and tracks.view_id[slot, camera] != bodies.ids[row]

@@ -58,6 +58,13 @@ def step(filter_: Filter, now: int, rules: Rules, track: Track, k: int) -> None:
     """Runs one tick of Alg. 3 with the frames stored since the last one, and writes row ``k`` of the track.
 
     Without a valid row the a-priori estimate stays as it is, Eq. (50), (51).
+
+    Args:
+        filter_: The filter before the tick, changed in place.
+        now: The tick [ns].
+        rules: Settings and limits.
+        track: Receives the row, and the counts of events.
+        k: Index of the row.
     """
     write_unknown(track, k)
     track.camera_points[k] = np.nan
@@ -112,7 +119,14 @@ def _predict(estimate: StateEstimate, now: int, rules: Rules, damping: Floats) -
 
 @njit(cache=True, inner=True)
 def store(frames: Frames, row: int, gate: Gate, superseded: Ints) -> None:
-    """Stores a frame that has arrived for the next tick, unless a newer one of the same camera has come before."""
+    """Stores a frame that has arrived for the next tick, unless a newer one of the same camera has come before.
+
+    Args:
+        frames: In order of arrival.
+        row: Index of the frame.
+        gate: Receives it.
+        superseded: (c,) number of a camera's frames for which a newer one had come; it is counted here.
+    """
     c = frames.camera[row]
     waiting = gate.uses[c] == 0
     late = gate.uses[c] >= 0 and frames.capture_ns[row] < gate.capture_ns[c]

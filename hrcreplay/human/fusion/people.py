@@ -21,10 +21,10 @@ from hrcreplay.human.fusion import fuse
 from hrcreplay.human.fusion.assignment import (
     EVENTS,
     FREE,
-    Bodies,
-    Rows,
+    ShownBodies,
+    StateRows,
+    TrackedBodies,
     TrackingRules,
-    Tracks,
     follow_ticks,
 )
 from hrcreplay.human.fusion.fuse import Trace
@@ -45,7 +45,7 @@ class PeopleRules(NamedTuple):
 class PeopleState(NamedTuple):
     """State of the tracking between two ticks."""
 
-    tracks: Tracks  #: one slot for each person, body that may become one, and some that are free
+    tracks: TrackedBodies  #: one slot for each person, body that may become one, and some that are free
     filters: Filter  #: those of the slots, their first axis
     spent: Bools  #: (p,) True for the numbers (index + 1) of all people so far
 
@@ -102,10 +102,10 @@ def follow(
     """
     n, cameras = len(measured), measured.cameras
     frames = fuse.as_frames(measured)
-    seen = Bodies(frames, np.array(bodies), np.zeros(n, np.int64), np.zeros(n, np.bool_), np.zeros(4, np.int64))
+    seen = ShownBodies(frames, np.array(bodies), np.zeros(n, np.int64), np.zeros(n, np.bool_), np.zeros(4, np.int64))
     tracking = TrackingRules(float(rules.jump_m), rules.memory_s * 1e9, np.array(rules.eyes_m), settings.fresh_s)
     filter_rules, ticks_ns, done = fuse.as_rules(settings, limits), np.array(ticks_ns), np.zeros(2, np.int64)
-    tracks = Tracks._make(array.copy() for array in state.tracks)
+    tracks = TrackedBodies._make(array.copy() for array in state.tracks)
     state = PeopleState(tracks, fuse.copied(state.filters), state.spent.copy())
     parts: list[tuple[HumanStates, Counter[str], Trace]] = []
     while True:
@@ -126,10 +126,10 @@ def follow(
     return Followed(state, seen.number, states, +found, trace)
 
 
-def _empty_rows(state: PeopleState, ticks: int, bodies: int, cameras: int, *, traced: bool) -> Rows:
+def _empty_rows(state: PeopleState, ticks: int, bodies: int, cameras: int, *, traced: bool) -> StateRows:
     """Makes rows for all ticks, if no more bodies are followed than now; the kernel asks for some more at each tick."""
     n = ticks * int((state.tracks.number > FREE).sum()) + bodies
-    return Rows(fuse.empty_track(n, cameras, traced=traced), np.empty(n, np.int64), np.empty(n, np.int64))
+    return StateRows(fuse.empty_track(n, cameras, traced=traced), np.empty(n, np.int64), np.empty(n, np.int64))
 
 
 def _with_free_slots(state: PeopleState, cameras: int, free: int) -> PeopleState:
@@ -156,9 +156,9 @@ def _joined(ours: _Slots, more: _Slots, used: Ints) -> _Slots:
     return type(ours)(*(np.concatenate([a[used], b]) for a, b in zip(ours, more, strict=True)))
 
 
-def _free_slots(cameras: int, free: int) -> tuple[Tracks, Filter]:
+def _free_slots(cameras: int, free: int) -> tuple[TrackedBodies, Filter]:
     """So many slots that nobody has used."""
-    tracks = Tracks(
+    tracks = TrackedBodies(
         number=np.full(free, FREE),
         is_person=np.zeros(free, np.bool_),
         born_ns=np.full(free, NEVER_NS),

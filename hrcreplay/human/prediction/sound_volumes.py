@@ -70,7 +70,7 @@ from hrcreplay.human.prediction.velocity_tube import (
     tube,
     tubes,
 )
-from hrcreplay.kernels import njit
+from hrcreplay.kernels import Held, njit
 from hrcreplay.records import DOF, LIMBS, Floats, HumanStates, Ints
 from hrcreplay.settings.sections import Prediction
 
@@ -145,13 +145,14 @@ class SoundRows(NamedTuple):
     speed: Floats  #: (n, 7) of the limbs of BODY [m/s]
 
 
-def sound_rows(states: HumanStates, prediction: Prediction, rules: SoundRules) -> SoundRows:
+def sound_rows(states: HumanStates, prediction: Prediction, rules: SoundRules, how: Held) -> SoundRows:
     """Computes what the volumes of all horizons have in common.
 
     Args:
         states: The fused person.
         prediction: Margins added to the model.
         rules: From ``sound_rules``, for the same settings.
+        how: The rules, and a surface to work with, for the kernel.
     """
     velocity, speed = motion_of_limbs(states)
     rows = SoundRows(
@@ -163,7 +164,7 @@ def sound_rows(states: HumanStates, prediction: Prediction, rules: SoundRules) -
         velocity=velocity,
         speed=speed,
     )
-    _radii_rows(rows, np.ascontiguousarray(states.residual_m), rules)
+    _radii_rows(rows, np.ascontiguousarray(states.residual_m), how)
     return rows
 
 
@@ -178,7 +179,7 @@ _POINTS = np.array(
 
 
 @njit(cache=True)
-def _radii_rows(rows: SoundRows, residual: Floats, rules: SoundRules) -> None:
+def _radii_rows(rows: SoundRows, residual: Floats, how: Held) -> None:
     """Writes the radii of volumes from the joints: those of the limbs plus the errors of the model.
 
     These errors are the displacement by an error of a length up the chain, the residual, and the offset of the points
@@ -187,6 +188,7 @@ def _radii_rows(rows: SoundRows, residual: Floats, rules: SoundRules) -> None:
     sum with a thigh's radius is larger, that sum is the radius. It is never reduced for legs last seen close to the
     line, as a table may hide a later change.
     """
+    rules, _ = how.value
     unknown, points, found = rules.unknown_m, rows.tubed.points, rows.radii
     modelled = np.full(points.shape[1:], np.nan)
     for i in range(len(found)):
@@ -213,22 +215,20 @@ def _beside_m(limb: int, points: Floats, modelled: Floats) -> float:
 
 
 @njit(cache=True)
-def sweep_sound(
-    rows: SoundRows, first: int, last: int, span_s: Floats, rules: SoundRules, work: Surface
-) -> tuple[Floats, Ints, Floats]:
+def sweep_sound(how: Held, rows: SoundRows, first: int, last: int, span_s: Floats) -> tuple[Floats, Ints, Floats]:
     """Computes the swept volumes of all limbs for the rows ``first`` to ``last`` - 1.
 
     Args:
+        how: ``SoundRules``, and a surface to work with.
         rows: The person.
         first: First row.
         last: Row after the last one.
         span_s: (n,) horizon and latency of each row [s].
-        rules: Settings and bounds.
-        work: From ``surface``.
 
     Returns:
         Vertices (m, 3) [m] and the offsets of ``SweptVolumes``, and (n, limbs) radii [m].
     """
+    rules, work = how.value
     limbs = rows.radii.shape[1]
     radii = rows.radii[first:last].copy()
     offsets = np.zeros((last - first) * limbs + 1, np.int64)

@@ -274,7 +274,7 @@ class Predictor:
             SettingsError: The method is unknown.
         """
         sound = code_of(self.prediction.method) == SOUND
-        rows = sound_rows(states, self.prediction, self.rules) if sound else None
+        rows = sound_rows(states, self.prediction, self.rules, self.how) if sound else None
         return PreparedPerson(self, states, rows)
 
     @cached_property
@@ -357,8 +357,8 @@ class PreparedPerson:
         t_ns, prediction = self.states.t_ns[first:last], self.predictor.prediction
         if self.rows is None:
             return self._printed(self.states.rows(slice(first, last)), horizon_s)
-        span_s, rules, work = horizon_s + prediction.latency_s, self.predictor.rules, self.predictor.work
-        vertices, offsets, radii = sweep_sound(self.rows, first, last, span_s, rules, work)
+        span_s = horizon_s + prediction.latency_s
+        vertices, offsets, radii = sweep_sound(self.predictor.how, self.rows, first, last, span_s)
         return SweptVolumes(t_ns, offsets, vertices, radii, self.predictor.limbs, prediction.method)
 
     def _printed(self, states: HumanStates, horizon_s: Floats) -> SweptVolumes:

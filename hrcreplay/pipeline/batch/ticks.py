@@ -146,8 +146,7 @@ def hulls_of(how: Held, rows: SoundRows, first: int, last: int, until_s: tuple[f
         until_s: Time from the tick on for which the volumes are valid, and that with the latency [s].
         known: Whether all people of the tick are.
     """
-    rules, work = how.value
-    vertices, offsets, radii = sweep_sound(rows, first, last, np.full(last - first, until_s[1]), rules, work)
+    vertices, offsets, radii = sweep_sound(how, rows, first, last, np.full(last - first, until_s[1]))
     radius = radii.reshape(-1)
     around, whole = boxes(vertices, offsets, radius)
     return TickHulls(vertices, offsets, radius, around, whole and known, until_s[0])
