@@ -13,10 +13,10 @@ from hrcreplay.human.model import LimitSet
 from hrcreplay.human.prediction import swept_volumes
 from hrcreplay.kernels import Held
 from hrcreplay.pipeline.batch.ticks import KNOWN, LEFT, TOO_OLD, PeopleAhead, hulls_of
-from hrcreplay.records import BORDER, Floats, HumanStates, Ints, SweptVolumes, volume_name
+from hrcreplay.records import BORDER, Bools, Floats, HumanStates, Ints, SweptVolumes, volume_name
 from hrcreplay.robot.control.border import Border
 from hrcreplay.robot.control.controllers import Predict
-from hrcreplay.robot.control.separation import Obstacles, join_obstacles, obstacles
+from hrcreplay.robot.control.separation import Obstacles, join_obstacles, obstacles, unknown_obstacles
 from hrcreplay.settings.sections import Prediction
 
 
@@ -182,16 +182,19 @@ class Forecast:
         person, states = self.person, self.states
         if person.rows is None or self.around.watched is not None:
             return None
-        first = self._first[:-1]
-        by_hand = np.logical_or.reduceat(person.by_points | person.partly_seen, first)
-        too_old = np.logical_or.reduceat(~(states.frame_age_s <= self.around.fresh_s), first)
+        by_hand = np.logical_or.reduceat(person.by_points | person.partly_seen, self._first[:-1])
         return PeopleAhead(
             person.rows,
             self._first,
             np.array(states.numbers),  # a copy, which is not protected
-            np.where(by_hand, LEFT, np.where(too_old, TOO_OLD, KNOWN)),
+            np.where(self._too_old, TOO_OLD, np.where(by_hand, LEFT, KNOWN)),
             person.predictor.prediction.latency_s,
         )
+
+    @cached_property
+    def _too_old(self) -> Bools:
+        """(k,) true for ticks with somebody whose newest frame is too old."""
+        return np.logical_or.reduceat(~(self.states.frame_age_s <= self.around.fresh_s), self._first[:-1])
 
     @property
     def how(self) -> Held:
@@ -209,6 +212,8 @@ class Forecast:
 
     def obstacles(self, tick: int, horizon_s: float) -> Obstacles:
         """Obstacles of one tick up to ``horizon_s`` [s]."""
+        if self.around.watched is None and self._too_old[tick]:
+            return unknown_obstacles(horizon_s)
         if horizon_s == self.around.prediction.horizon_s:
             return self._of_rows(tick, horizon_s, 0, self.full)
         rows, self._lasted = self.rows(tick), self._lasted + 1 if self._last == (tick - 1, horizon_s) else 0
@@ -216,7 +221,7 @@ class Forecast:
         first, found = self._ahead.get(horizon_s, (0, None))
         if found is None or not first <= rows.start <= rows.stop <= first + len(found):
             together = min(self._lasted, self.most_ahead, len(self.t_ns) - 1 - tick)
-            if not together and self.ahead is not None and self.ahead.what[tick] != LEFT:
+            if not together and self.ahead is not None and self.ahead.what[tick] == KNOWN:
                 return self._alone(self.ahead, tick, horizon_s)
             first, found = rows.start, self.person.volumes(horizon_s, rows.start, self.rows(tick + together).stop)
             self._ahead[horizon_s] = first, found
@@ -234,9 +239,8 @@ class Forecast:
 
     def _alone(self, ahead: PeopleAhead, tick: int, horizon_s: float) -> Obstacles:
         """Obstacles of a tick alone, in one kernel: in half the time, and the same numbers."""
-        rows, known = self.rows(tick), bool(ahead.what[tick] == KNOWN)
-        until_s = horizon_s, horizon_s + ahead.latency_s
-        hulls = hulls_of(self.how, ahead.rows, rows.start, rows.stop, until_s, known)
+        rows, until_s = self.rows(tick), (horizon_s, horizon_s + ahead.latency_s)
+        hulls = hulls_of(self.how, ahead.rows, rows.start, rows.stop, until_s, True)
         found = Obstacles(hulls.vertices, hulls.offsets, hulls.radius, hulls.boxes, hulls.known, horizon_s)
         return self.around.numbered(found, ahead.number[rows].tolist())
 

@@ -146,10 +146,12 @@ def hulls_of(how: Held, rows: SoundRows, first: int, last: int, until_s: tuple[f
         until_s: Time from the tick on for which the volumes are valid, and that with the latency [s].
         known: Whether all people of the tick are.
     """
+    if not known:  # the robot stands, and no volume is looked at
+        return TickHulls(np.empty((0, 3)), np.zeros(1, np.int64), np.empty(0), np.empty((0, 2, 3)), False, until_s[0])
     vertices, offsets, radii = sweep_sound(how, rows, first, last, np.full(last - first, until_s[1]))
     radius = radii.reshape(-1)
     around, whole = boxes(vertices, offsets, radius)
-    return TickHulls(vertices, offsets, radius, around, whole and known, until_s[0])
+    return TickHulls(vertices, offsets, radius, around, whole, until_s[0])
 
 
 @njit(cache=True, inner=True)

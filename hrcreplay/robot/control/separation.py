@@ -60,6 +60,11 @@ def no_obstacles() -> Obstacles:
     return Obstacles(np.empty((0, 3)), np.zeros(1, np.int64), np.empty(0), np.empty((0, 2, 3)), known=True)
 
 
+def unknown_obstacles(horizon_s: float) -> Obstacles:
+    """What is known of a tick if somebody is not: nothing, so the robot stands, and no volume is looked at."""
+    return no_obstacles()._replace(known=False, horizon_s=horizon_s)
+
+
 def join_obstacles(people: Sequence[Obstacles]) -> Obstacles:
     """The volumes of several people of one tick as those of one, person after person; one or more."""
     if len(people) == 1:
