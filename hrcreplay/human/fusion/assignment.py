@@ -164,17 +164,15 @@ def _write(
 @njit(cache=True, inner=True)
 def _kept(slots: Ints, tracks: TrackedBodies, now: int, tracking: TrackingRules) -> Bools:
     """(s,) true for people who are remembered, at least the last one, and for bodies that a camera has just shown."""
-    kept, last, somebody = np.zeros(len(tracks.number), np.bool_), -1, False
+    kept, last = np.zeros(len(tracks.number), np.bool_), -1
     for slot in slots:
         if not tracks.is_person[slot]:
             kept[slot] = (now - tracks.shown_ns[slot]) * 1e-9 <= tracking.fresh_s
             continue
         kept[slot] = now - tracks.seen_ns[slot] <= tracking.memory_ns
-        somebody = somebody or kept[slot]
         if last < 0 or tracks.seen_ns[slot] > tracks.seen_ns[last]:
             last = slot
-    if not somebody:
-        kept[last] = True
+    kept[last] = True
     return kept
 
 

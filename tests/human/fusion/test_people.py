@@ -278,6 +278,33 @@ def test_a_person_who_leaves_is_unknown_for_the_memory_and_the_last_one_for_ever
     assert found.states.of_person(1).t_ns[-1] == 7996 * MS
 
 
+def test_the_person_seen_last_is_the_one_who_stays() -> None:
+    frames = Frames()
+    frames.every(0, 1000, 0, at(1.5))
+    frames.every(0, 2000, 1, at(3.0, 1.0))
+    states = frames.track(7000).states
+    assert states.of_person(1).t_ns[-1] < 3100 * MS
+    assert states.of_person(2).t_ns[-1] == 6996 * MS
+
+
+@pytest.mark.parametrize("until_ms", [240, 244])
+def test_rows_are_enough_whenever_somebody_comes(until_ms: int) -> None:
+    """Rows are made for the people of now; here one more comes at any tick of a call, and has a slot already."""
+    ticks = np.arange(0, until_ms, 4) * MS
+    for at_ms in range(40, 200, 4):
+        frames = Frames()
+        frames.add(0, 0, at(1.5))
+        frames.add(20, 1, at(3.0, 2.0), at(3.05, 2.0))  # one is the other shown twice, so a slot is left
+        frames.add(at_ms, 0, at(1.5, 2.5), first_id=7)
+        measured, bodies = frames.measured()
+        whole = track(measured, bodies, STANDING, ticks)
+        pieces = track(measured, bodies, STANDING, ticks, batch=1)
+        assert set(whole.states.numbers.tolist()) == {1, 2, 3}
+        assert whole.numbers.tolist() == pieces.numbers.tolist()
+        for name in ("t_ns", "numbers", "points_m"):
+            assert getattr(whole.states, name).tobytes() == getattr(pieces.states, name).tobytes(), (at_ms, name)
+
+
 def test_a_hidden_person_is_expected_where_the_last_steps_lead() -> None:
     """Two people walk towards each other, are hidden while they pass, and come out on the other side."""
     frames = Frames()
