@@ -192,6 +192,8 @@ def test_bodies_at_random_are_followed_as_one_by_one(seed: int) -> None:
             frames.add(at_ms + 10 * camera, camera, *(shown[k] for k in order[:cut]), first_id=int(rng.integers(1, 3)))
             frames.add(at_ms + 10 * camera, camera, *(shown[k] for k in order[cut:]), first_id=5)
     measured, bodies = frames.measured(rng.integers(0, 3, len(frames.rows)) * 20)
+    unsure = rng.random(measured.confidence.shape) < 0.03  # points that a tracker gives without a confidence
+    measured = replace(measured, confidence=np.where(unsure, 0.0, measured.confidence))
     ticks, rules = np.arange(0, 4200, 12) * MS, PeopleRules(0.8, 0.5, np.zeros((2, 3)))
     settings = Fusion(fresh_s=0.1)
     expected = tracked_one_by_one.follow(ticks, measured, bodies, rules, settings, load_limits("human"))
@@ -276,6 +278,13 @@ def test_a_person_who_leaves_is_unknown_for_the_memory_and_the_last_one_for_ever
     assert gone.t_ns[-1] == last_ns + 2000 * MS
     assert gone.frame_age_s[-1] > 1.9
     assert found.states.of_person(1).t_ns[-1] == 7996 * MS
+
+
+def test_the_first_person_is_the_one_nearest_to_the_camera() -> None:
+    frames = Frames()
+    frames.every(0, 500, 0, at(3.0, 1.0), at(2.0, -1.0), at(2.5))
+    found = frames.track(600)
+    assert found.numbers[:3].tolist() == [2, 1, 3]
 
 
 def test_the_person_seen_last_is_the_one_who_stays() -> None:
