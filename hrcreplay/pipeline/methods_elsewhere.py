@@ -22,8 +22,8 @@ from hrcreplay.records import Floats, HumanStates, Ints
 from hrcreplay.store.columns import state_columns
 from hrcreplay.store.run_folder import FolderTables, Stopwatch
 
-#: Number of batches that may wait for the second process: about 2.5 kB per tick.
-_MOST_WAITING = 100
+#: Number of batches that may wait for the second process: 4 kB per tick and person, and no more is gained by more.
+_MOST_WAITING = 16
 #: Stage -> ticks and duration [ns] of each call.
 Calls = dict[str, list[tuple[int, int]]]
 
