@@ -104,10 +104,7 @@ class TableWriter:
     def _flush(self, table: pa.Table) -> None:
         if self._writer is None:
             names = [field.name for field in table.schema if pa.types.is_string(field.type)]  # numbers hardly repeat
-            times = [field.name for field in table.schema if field.name.endswith("_ns")]  # what a reader looks up
-            self._writer = pq.ParquetWriter(
-                self._path, table.schema, compression="lz4", use_dictionary=names, write_statistics=times
-            )
+            self._writer = pq.ParquetWriter(self._path, table.schema, compression="lz4", use_dictionary=names)
         self._writer.write_table(table.combine_chunks())
 
     def close(self) -> None:
