@@ -287,6 +287,13 @@ def test_the_first_person_is_the_one_nearest_to_the_camera() -> None:
     assert found.numbers[:3].tolist() == [2, 1, 3]
 
 
+def test_whoever_comes_after_the_memory_is_the_person_who_stayed() -> None:
+    frames = Frames()
+    frames.every(0, 1000, 0, at(1.5))
+    frames.every(4000, 5000, 0, at(4.0, 1.0))
+    assert set(frames.track(5000).numbers.tolist()) == {1}
+
+
 def test_the_person_seen_last_is_the_one_who_stays() -> None:
     frames = Frames()
     frames.every(0, 1000, 0, at(1.5))
