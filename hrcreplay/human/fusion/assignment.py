@@ -145,7 +145,7 @@ def _write(
     rows: StateRows,
     at: int,
 ) -> int:
-    """Completes row ``at`` after the tick of a slot's filter; returns the number of rows with it, which the last lacks.
+    """Completes row ``at`` after the tick of a slot's filter; returns 1, or 0 if nobody is there and the row is free.
 
     ``numbers`` are those of the bodies that the tick's frames showed.
     """
@@ -163,7 +163,10 @@ def _write(
 
 @njit(cache=True, inner=True)
 def _kept(slots: Ints, tracks: TrackedBodies, now: int, tracking: TrackingRules) -> Bools:
-    """(s,) true for people who are remembered, at least the last one, and for bodies that a camera has just shown."""
+    """(s,) true for people who are remembered, at least the last one, and for bodies that a camera has just shown.
+
+    There is always a person, as the last one is kept.
+    """
     kept, last = np.zeros(len(tracks.number), np.bool_), -1
     for slot in slots:
         if not tracks.is_person[slot]:
