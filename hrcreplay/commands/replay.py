@@ -36,7 +36,7 @@ from hrcreplay.reporting import tables
 from hrcreplay.reporting.summary_text import defect_notes
 from hrcreplay.store import run_folder
 from hrcreplay.store.columns import read_states
-from hrcreplay.store.memory import release_freed_memory
+from hrcreplay.store.memory import release_after, release_freed_memory
 from hrcreplay.store.run_folder import RunWriter, Stopwatch
 
 REPORTS = Path("reports")
@@ -250,8 +250,8 @@ def run_stages(
         every = store_every(run_config)
         flow = stages.predict_batches(states, assembly.prediction_stage(run_config), every, sink)
     if todo:
-        for _ in flow:
-            pass
+        for batch, _ in enumerate(flow):
+            release_after(batch)
     if elsewhere is not None:
         sink.watch.calls.update(elsewhere.finish())
     return {"fuse": collect_fusion_findings(log, sink), "plan": collect_plan_findings(log, sink)}

@@ -20,6 +20,7 @@ from hrcreplay.pipeline.stored_volumes import store_ticks
 from hrcreplay.pipeline.surroundings import Forecast
 from hrcreplay.records import Floats, HumanStates, Ints
 from hrcreplay.store.columns import state_columns
+from hrcreplay.store.memory import release_after
 from hrcreplay.store.run_folder import FolderTables, Stopwatch
 
 #: Number of batches that may wait for the second process: 4 kB per tick and person, and no more is gained by more.
@@ -70,6 +71,7 @@ class _Work:
         self._surroundings = assembly.surroundings(run_config, robot)
         moved = assembly.followers(run_config, assembly.programme(run_config, log, robot), start_ns) if names else {}
         self._methods = MethodsFollowing(self._surroundings, {name: moved[name] for name in names}, self._sink)
+        self._batches = 0
 
     def take(self, batch: HumanStates, stored: Ints, horizon_s: Floats) -> None:
         if self._fused:
@@ -78,6 +80,8 @@ class _Work:
         self._methods.take(forecast)
         with self._sink.watch.stage("hulls", len(forecast.t_ns)):
             store_ticks(forecast, stored, horizon_s, self._tables)
+        release_after(self._batches)
+        self._batches += 1
 
     def finish(self) -> Calls:
         self._tables.close_tables()
