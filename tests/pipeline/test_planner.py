@@ -27,6 +27,7 @@ from hrcreplay.robot.control.control_step import (
     at_rest,
 )
 from hrcreplay.robot.control.controllers import CONTROLLERS
+from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.robot.model import RobotModel, irb140
 from hrcreplay.robot.path import plan_programme
 from hrcreplay.robot.task import parse_task
@@ -91,8 +92,14 @@ def planner(method: str, plan: dict[str, Any], *, objects: bool = False) -> Plan
     return Planner(CONTROLLERS[method](robot(), path, settings, static=static), chosen=True)
 
 
-def tick_by_tick(one: Planner, around: Surroundings, people: HumanStates, names: tuple[str, ...]) -> Motion:
-    forecast = Forecast(around, people, most_ahead=0)
+def tick_by_tick(
+    one: Planner,
+    around: Surroundings,
+    people: HumanStates,
+    names: tuple[str, ...],
+    outlook: type[Forecast] = Forecast,
+) -> Motion:
+    forecast = outlook(around, people, most_ahead=0)
     rows = [one.controller.step(forecast.predict(tick)).row for tick in range(len(forecast.t_ns))]
     links = tuple(segment.name for segment in robot().segments)
     return Motion.of_rows(forecast.t_ns, rows, limbs=names, links=links, reasons=REASONS)
@@ -165,6 +172,27 @@ def test_in_batches_every_method_moves_as_tick_by_tick(
     assert len(set(expected.limb.tolist())) > 2
     if method != "none":
         assert NO_HUMAN in expected.reason
+
+
+class _EveryVolume(Forecast):
+    """Obstacles from the volumes of all people, also of those who are not known."""
+
+    def obstacles(self, tick: int, horizon_s: float) -> Obstacles:
+        rows = self.rows(tick)
+        volumes = self.around.prediction.volumes(self.states.rows(rows), horizon_s)
+        people = [obstacles(volumes, row, horizon_s) for row in range(len(volumes))]
+        return self.around.obstacles(self.states, rows, people)
+
+
+@pytest.mark.parametrize("method", ["qp", "scaling", "shield", "ssm", "none"])
+def test_volumes_of_people_who_are_not_known_make_no_difference(method: str) -> None:
+    around, people = Surroundings(STAGE, FRESH_S), _with_every_kind(visitors())
+    names, every = around.names_of(3), _EveryVolume(around, people)
+    unknown = [tick for tick in range(TICKS) if not every.obstacles(tick, 0.1).known]
+    assert len(unknown) > 10
+    expected = tick_by_tick(planner(method, {}), around, people, names, _EveryVolume)
+    assert_same(tick_by_tick(planner(method, {}), around, people, names), expected)
+    assert_same(followed(planner(method, {}), around, people, names, (250, 650))[0], expected)
 
 
 def test_the_motions_compared_hold_what_makes_a_difference() -> None:
