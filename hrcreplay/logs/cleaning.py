@@ -355,7 +355,7 @@ class Cleaner:
         if (
             before is None
             or not row.confidence.any()
-            or not (before[0].points_m == row.points_m).any()  # mostly so, and found out in a third of the time
+            or not (before[0].points_m == row.points_m).any()  # the usual case, found in a third of the time
             or not np.array_equal(before[0].points_m, row.points_m, equal_nan=True)
             or not np.array_equal(before[0].confidence, row.confidence)
         ):

@@ -102,7 +102,9 @@ def follow(
     """
     n, cameras = len(measured), measured.cameras
     frames = fuse.as_frames(measured)
-    seen = ShownBodies(frames, np.array(bodies), np.zeros(n, np.int64), np.zeros(n, np.bool_), np.zeros(4, np.int64))
+    seen = ShownBodies(
+        frames, np.array(bodies), np.zeros(n, np.int64), np.zeros(n, np.bool_), np.zeros(len(EVENTS), np.int64)
+    )
     tracking = TrackingRules(float(rules.jump_m), rules.memory_s * 1e9, np.array(rules.eyes_m), settings.fresh_s)
     filter_rules, ticks_ns, done = fuse.as_rules(settings, limits), np.array(ticks_ns), np.zeros(2, np.int64)
     tracks = TrackedBodies._make(array.copy() for array in state.tracks)

@@ -14,6 +14,7 @@ from scipy.optimize import linear_sum_assignment
 from hrcreplay.human.fusion import fuse
 from hrcreplay.human.fusion.assignment import apart, least_sum
 from hrcreplay.human.fusion.inverse_kinematics import measure
+from hrcreplay.human.fusion.kalman import Filter, one_of
 from hrcreplay.human.fusion.people import PeopleRules, PeopleState, follow, start
 from hrcreplay.human.model import skeleton
 from hrcreplay.limits import load_limits
@@ -278,6 +279,16 @@ def test_a_person_who_leaves_is_unknown_for_the_memory_and_the_last_one_for_ever
     assert gone.t_ns[-1] == last_ns + 2000 * MS
     assert gone.frame_age_s[-1] > 1.9
     assert found.states.of_person(1).t_ns[-1] == 7996 * MS
+
+
+def test_the_filter_of_a_person_has_each_field_of_that_slot() -> None:
+    start_ = fuse.start(CAMERAS)
+    slots = Filter(*(type(part)(*(np.stack([array, array]) for array in part)) for part in start_))  # type: ignore[arg-type]
+    of_second = one_of.py_func(slots, 1)
+    for part, second in zip(slots, of_second, strict=True):
+        for array, mine in zip(part, second, strict=True):
+            assert np.shares_memory(mine, array[1])
+            assert mine.shape == array.shape[1:]
 
 
 def test_the_first_person_is_the_one_nearest_to_the_camera() -> None:
