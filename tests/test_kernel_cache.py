@@ -92,7 +92,7 @@ def _calls_from_python(path: Path, module: str) -> set[str]:
     found: set[str] = set()
 
     def visit(node: ast.AST) -> None:
-        if _is_kernel(node):
+        if _is_kernel(node) or (isinstance(node, ast.Attribute) and node.attr == "py_func"):  # that is plain Python
             return
         if isinstance(node, ast.Name) and node.id in known:
             found.add(known[node.id])
