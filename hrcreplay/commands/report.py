@@ -178,6 +178,7 @@ def _draw_figures(
 
     def here(task: _Drawing) -> tuple[str, ...]:
         drawn = task.draw(everybody, metrics)
+        release_freed_memory()
         progress.advance("figures")
         return drawn
 
@@ -206,7 +207,9 @@ class _Drawing:
 
     def draw_there(self, run: Path, meta: str, metrics: Mapping[str, Metric]) -> tuple[str, ...]:
         """Draws it in the second process."""
-        return self.draw(_tables(run, meta), metrics)
+        drawn = self.draw(_tables(run, meta), metrics)
+        release_freed_memory()
+        return drawn
 
 
 def scene_of(run_config: RunConfig, run: Run) -> ReplayScene | None:

@@ -111,12 +111,13 @@ def severity_table(
     distance, moving = contact["distance_m"].to_numpy(dtype=float), contact["moving"].to_numpy(dtype=bool)
     t_ns = contact["t_ns"].to_numpy()
     found, touching = [], moving & (distance <= 0.0)
+    tick_s = float(np.median(np.diff(t_ns))) * 1e-9 if len(t_ns) > 1 else 0.0
     every = meeting.impacts(method, CONTACT, motion, contact, np.flatnonzero(touching))
     for first, last in merged_runs(touching, t_ns):
         ticks = first + np.flatnonzero(touching[first:last])
         impacts = list(islice(every, len(ticks)))
         worst = max(impacts, key=lambda one: (np.nan_to_num(one.share, nan=-1.0), np.nan_to_num(one.relative_speed)))
-        found.append(_lasting(worst, float(t_ns[ticks[-1]] - t_ns[ticks[0]]) * 1e-9 + _tick_s(t_ns)))
+        found.append(_lasting(worst, float(t_ns[ticks[-1]] - t_ns[ticks[0]]) * 1e-9 + tick_s))
     near = np.where(moving & np.isfinite(distance), distance, np.inf)
     if not found and len(near) and np.isfinite(near.min()):
         found = list(meeting.impacts(method, NEAREST, motion, contact, np.array([int(np.argmin(near))])))
@@ -138,10 +139,6 @@ def merged_runs(mask: Bools, t_ns: Ints) -> list[tuple[int, int]]:
         else:
             found.append((first, last))
     return found
-
-
-def _tick_s(t_ns: Ints) -> float:
-    return float(np.median(np.diff(t_ns))) * 1e-9 if len(t_ns) > 1 else 0.0
 
 
 def _lasting(impact: Impact, duration_s: float) -> Impact:

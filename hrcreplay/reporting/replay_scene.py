@@ -542,19 +542,27 @@ def _stops(
         return np.where(np.isfinite(tau_s)[:, None], np.array(ends), np.nan)
     if method == RECORDED or "programme_s" not in motion:
         return straight
-    tables = [motion, *(table for name, table in run.baselines.items() if name == "none")]
-
-    def driven(name: str) -> Floats:
-        return np.concatenate([table[name].to_numpy(dtype=float) for table in tables])
-
     row, _ = _rows(motion, t_ns)
     rate = np.gradient(numeric_column(motion, "programme_s"), times(motion) * 1e-9)[row]
     at_s = numeric_column(motion, "programme_s")[row] + 0.5 * rate * tau_s
-    s_s, first = np.unique(driven("programme_s"), return_index=True)
-    beside = np.searchsorted(s_s, at_s)[:, None] - [1, 0]  # few of a long run
-    beside = np.unique(np.clip(beside, 0, len(s_s) - 1))
-    s_s, first = s_s[beside], first[beside]
-    return np.column_stack([np.interp(at_s, s_s, driven(f"q{i}")[first]) for i in range(1, robot.nv + 1)])
+    tables = [motion, *(table for name, table in run.baselines.items() if name == "none")]
+    found = [_driven_beside(table, at_s, robot.nv) for table in tables]
+    s_s, first = np.unique(np.concatenate([known for known, _ in found]), return_index=True)
+    driven = np.concatenate([joints for _, joints in found])[first]
+    return np.column_stack([np.interp(at_s, s_s, joint) for joint in driven.T])
+
+
+def _driven_beside(motion: RunTable, at_s: Floats, axes: int) -> tuple[Floats, Floats]:
+    """Returns programmed times (k,) before and after some others [s], and (k, axes) joints first driven there [rad].
+
+    Few rows of a long run. The programmed time of a motion never decreases.
+    """
+    programme_s = numeric_column(motion, "programme_s")
+    after = np.searchsorted(programme_s, at_s)
+    beside = np.unique(np.clip(np.concatenate([after - 1, after]), 0, len(programme_s) - 1))
+    rows = np.unique(np.searchsorted(programme_s, programme_s[beside]))
+    joints = [numeric_column(motion, f"q{i}")[rows] for i in range(1, axes + 1)]
+    return programme_s[rows], np.column_stack(joints)
 
 
 def _names(motion: RunTable, column: str, at_ns: Ints) -> tuple[tuple[str, ...], Ints]:

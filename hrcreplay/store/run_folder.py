@@ -25,8 +25,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from hrcreplay.errors import SettingsError
-from hrcreplay.records import RECORDED, Floats
-from hrcreplay.store.stored_table import RunTable, StoredTable
+from hrcreplay.records import JOINTS, RECORDED, Bools, Floats
+from hrcreplay.store.stored_table import RunTable, StoredTable, in_parts
 
 #: The outputs that may differ between two runs on the same log and settings.
 NOT_DETERMINISTIC = frozenset({"run.json", "timing.json"})
@@ -265,9 +265,24 @@ class Run:
             return (1,)
         return tuple(sorted({1, *self.state["person"][self.state["x"].notna()].tolist()}))
 
+    @cached_property
+    def known(self) -> Bools:
+        """(n,) True for the rows of ``state`` at which the person is known; () without a state."""
+        parts = [] if self.state is None else in_parts(self.state, JOINTS)
+        known = [np.isfinite(part.to_numpy(dtype=float)).all(axis=1) for part in parts]
+        return np.concatenate([np.zeros(0, dtype=np.bool_), *known])
+
+    @cached_property
+    def _alone(self) -> dict[int, Self]:
+        return {}
+
     def of_person(self, number: int) -> Self:
         """The run as if it had tracked one person alone; the motion is that near all people."""
+        if number not in self._alone:
+            self._alone[number] = self._only(number)
+        return self._alone[number]
 
+    def _only(self, number: int) -> Self:
         def rows(table: Any) -> Any:
             if table is None or "person" not in table:
                 return table

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import weakref
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
@@ -16,6 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from hrcreplay.records import Bools, Floats, Ints
+from hrcreplay.store.memory import release_freed_memory
 
 #: An array of any type.
 Anything = np.ndarray[tuple[int, ...], np.dtype[Any]]
@@ -24,6 +25,8 @@ Anything = np.ndarray[tuple[int, ...], np.dtype[Any]]
 _GROUPS = 8
 #: Memory of the columns of all files that are kept, as most are asked for more than once [bytes].
 _KEPT_BYTES = 32_000_000
+#: A longer column belongs to a long run: what was freed since the last one is given back, as it would add up [bytes].
+_LONG_BYTES = 4_000_000
 
 
 class StoredTable:
@@ -85,10 +88,17 @@ class StoredTable:
             KeyError: There is no such column.
         """
         if isinstance(key, str):
-            return self._read([key], self._rows)[key]
+            return self._one(key)
         if isinstance(key, list):
             return self._read(key, self._rows)
         return self._where(np.asarray(key, dtype=np.bool_))
+
+    def _one(self, name: str) -> pd.Series[Any]:
+        if name in self._made:
+            return pd.Series(self._made[name], name=name)
+        if name not in self.columns:
+            raise KeyError(name)
+        return self._file.column(name, self._rows)
 
     def _where(self, mask: Bools) -> StoredTable:
         rows, mine = mask, self._rows
@@ -127,6 +137,17 @@ class StoredTable:
         mask = np.zeros(len(self), dtype=np.bool_)
         mask[places] = True
         return self._where(mask)[list(self.columns)]
+
+    def parts(self, names: Sequence[str]) -> Iterator[pd.DataFrame]:
+        """Yields some columns of the file, some rows after the others: whole columns of a long run fill memory.
+
+        Raises:
+            KeyError: There is no such column.
+        """
+        if absent := [name for name in names if name not in self.columns or name in self._made]:
+            raise KeyError(absent[0])
+        for part in self._file.parts(list(names), self._rows):
+            yield part.to_pandas(split_blocks=True, self_destruct=True)
 
     def _read(self, names: list[str], rows: Bools | None) -> pd.DataFrame:
         if absent := [name for name in names if name not in self.columns]:
@@ -204,31 +225,45 @@ class _File:
 
     def read(self, names: list[str], rows: Bools | None) -> pd.DataFrame:
         """Some columns, of all rows or of those (n,) that are True."""
-        if rows is None:
-            return pd.DataFrame({name: self._column(name) for name in names})
-        groups = [i for i, (a, b) in enumerate(pairwise(self._starts)) if rows[a:b].any()]
-        if len(names) == 1 and 2 * len(groups) > len(self._starts) - 1:  # it may be asked for again
-            return pd.DataFrame({names[0]: self._column(names[0])[rows].reset_index(drop=True)})
-        return self._some(names, rows, groups or [0])
+        if len(names) == 1 or rows is None:
+            return pd.DataFrame({name: self.column(name, rows) for name in names})
+        return pa.concat_tables(list(self.parts(names, rows))).to_pandas(split_blocks=True, self_destruct=True)
 
-    def _some(self, names: list[str], rows: Bools, groups: list[int]) -> pd.DataFrame:
-        """Some rows of some columns, read few groups of rows at a time: all columns of a long run would fill memory."""
-        found = []
+    def column(self, name: str, rows: Bools | None) -> pd.Series[Any]:
+        """A column, of all rows or of those (n,) that are True; kept where it may be asked for again."""
+        if rows is None:
+            return self._whole(name)
+        if 2 * len(self._groups(rows)) > len(self._starts) - 1:
+            return self._whole(name)[rows].reset_index(drop=True)
+        found = pa.concat_tables(list(self.parts([name], rows)))
+        return found.to_pandas(split_blocks=True, self_destruct=True)[name]
+
+    def _groups(self, rows: Bools | None) -> list[int]:
+        """The groups of rows that have some of these rows."""
+        return [i for i, (a, b) in enumerate(pairwise(self._starts)) if rows is None or rows[a:b].any()]
+
+    def parts(self, names: list[str], rows: Bools | None) -> Iterator[pa.Table]:
+        """Yields some columns, of all rows or of those (n,) that are True, of few groups of rows at a time."""
+        groups = self._groups(rows) or [0]
         with self._opened() as file:
             for k in range(0, len(groups), _GROUPS):
                 few = groups[k : k + _GROUPS]
-                kept = np.concatenate([rows[self._starts[i] : self._starts[i + 1]] for i in few])
                 table = file.read_row_groups(few, columns=names, use_threads=False)
-                found.append(table.filter(pa.array(kept)))
-        return pa.concat_tables(found).to_pandas(split_blocks=True, self_destruct=True)
+                if rows is not None:
+                    kept = np.concatenate([rows[self._starts[i] : self._starts[i + 1]] for i in few])
+                    table = table.filter(pa.array(kept))
+                yield table
 
-    def _column(self, name: str) -> pd.Series[Any]:
+    def _whole(self, name: str) -> pd.Series[Any]:
         """A whole column, kept or read."""
         found = _LAST.get(id(self), name)
         if found is None:
             with self._opened() as file:
-                found = file.read(columns=[name], use_threads=False).to_pandas()[name]
+                table = file.read(columns=[name], use_threads=False)
+            found = table.to_pandas(split_blocks=True, self_destruct=True)[name]
             _LAST.keep(id(self), name, found)
+            if found.nbytes > _LONG_BYTES:
+                release_freed_memory()
         return found
 
 
@@ -251,6 +286,18 @@ class _Places:
 
 #: A table of a run: in its folder, or in memory.
 RunTable = pd.DataFrame | StoredTable
+
+
+def in_parts(table: RunTable, names: Sequence[str]) -> Iterator[pd.DataFrame]:
+    """Yields some columns of a table, some rows after the others, in order; a table in memory as it is.
+
+    Raises:
+        KeyError: There is no such column.
+    """
+    if isinstance(table, StoredTable):
+        yield from table.parts(names)
+    else:
+        yield table[list(names)]
 
 
 def number_columns(table: RunTable, names: Sequence[str]) -> Floats:

@@ -40,7 +40,7 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 def test_the_figure_of_volumes_holds_the_runs_own_method(sound: Run) -> None:
-    people = figure_data._states(read_run_config(sound.folder), sound)
+    people = figure_data._states(read_run_config(sound.folder), sound, ["instants"])
     assert people is not None
     (_, methods), *others = figure_data.volumes_by_method(read_run_config(sound.folder), sound, people)
     assert len(others) == 3
@@ -195,7 +195,7 @@ def test_a_forearms_sweep_encloses_its_arc(data: FigureData) -> None:
 
 def test_a_forearm_whose_length_nobody_measured_is_not_swept(sound: Run) -> None:
     run_config = read_run_config(sound.folder)
-    people = figure_data._states(run_config, sound)
+    people = figure_data._states(run_config, sound, ["sweep", "growth"])
     assert people is not None
     unknown = dataclasses.replace(people, lengths_m=people.lengths_m * np.nan)
     assert figure_data.forearm_sweep(run_config, sound, people) is not None

@@ -14,6 +14,8 @@ from hrcreplay.reporting.figures import catalogue, planning, prediction
 from hrcreplay.reporting.figures.catalogue import FIGURES, FigureData
 from hrcreplay.reporting.figures.prediction import Growth, Sweep, Walk
 from hrcreplay.reporting.figures.scene import ABOVE, RenderedHull, render_hulls, view_from
+from hrcreplay.reporting.metrics import series
+from hrcreplay.reporting.metrics.planning import deviation_m
 from hrcreplay.reporting.metrics.series import instants
 from hrcreplay.reporting.tables import LIMB_NAMES
 from hrcreplay.store.run_folder import Run
@@ -198,6 +200,12 @@ def test_the_largest_deviation_is_where_the_tcp_was_furthest_from_every_point_of
     assert found.length_m == pytest.approx(nearest.max(), abs=2e-3)
     assert nearest[found.row] == pytest.approx(nearest.max(), abs=2e-3)
     np.testing.assert_array_equal(found.at_m, tcp[found.row])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(series, "_TOGETHER", 7)
+        again = planning.largest_deviation(run.motion)
+        assert deviation_m(run.motion).argmax() == again.row == found.row
+        np.testing.assert_array_equal(again.foot_m, found.foot_m)
+        assert deviation_m(run.motion).max() == found.length_m
 
 
 def test_instants_are_a_second_apart_and_hold_the_nearest() -> None:

@@ -9,11 +9,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from hrcreplay.records import JOINTS
+from hrcreplay.records import JOINTS, Floats
 from hrcreplay.reporting.metrics import series
 from hrcreplay.reporting.metrics.fusion import frames_of
 from hrcreplay.reporting.metrics.planning import add_plan, cycles, waited_s
-from hrcreplay.reporting.metrics.series import MetricTable, path_feet
+from hrcreplay.reporting.metrics.series import MetricTable, feet_in_turn
 from hrcreplay.store.run_folder import Run
 from tests.reporting.synthetic import T0_NS, frame_of, make_run, metrics_of
 
@@ -272,6 +272,15 @@ def test_no_separation_at_all_is_null(run: Run) -> None:
     for name in ("plan_separation_min_m", "plan_separation_min_limb", "plan_stationary_share"):
         assert found[name]["value"] is None
     assert found["plan_separation_unknown_ticks"]["value"] == found["plan_ticks"]["value"]
+
+
+def path_feet(points: Floats, path: Floats) -> Floats:
+    """(n, 3) the feet of all points; NaN for an unknown one."""
+    feet = np.full(points.shape, np.nan)
+    for rows, found in feet_in_turn(points, path):
+        assert np.isnan(feet[rows]).all()
+        feet[rows] = found
+    return feet
 
 
 def test_distance_from_a_path_is_to_its_segments() -> None:

@@ -7,6 +7,7 @@ import zlib
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.interpolate import interp1d
 from scipy.linalg import expm
@@ -15,6 +16,7 @@ from hrcreplay.human.model import skeleton
 from hrcreplay.records import JOINTS, LENGTHS, LIMBS, POINTS, Floats
 from hrcreplay.reporting import replay_scene
 from hrcreplay.reporting.metrics.contact import stop_events
+from hrcreplay.reporting.page import replay_page
 from hrcreplay.reporting.page.replay_page import MISSING, NumberBlock, replay_data
 from hrcreplay.reporting.replay_scene import (
     LONG_VOLUME_HZ,
@@ -123,6 +125,20 @@ def test_every_stop_on_the_path_ends_between_the_driven_joints_beside_it(scene: 
     np.testing.assert_allclose(scene.methods["scaling"].stop_q[within], every(ends_s[within]), atol=1e-9)
 
 
+def test_stops_on_the_path_end_also_between_joints_that_the_robot_without_a_person_drove() -> None:
+    run = moving_run(8.0)
+    table = frame_of(run.baselines["scaling"])
+    alone = table.assign(programme_s=table["programme_s"] * 1.1 + 0.0037)
+    alone = alone.assign(**{f"q{i}": table[f"q{i}"] + 0.01 for i in range(1, 7)})
+    found = moving_scene(dataclasses.replace(run, baselines={**run.baselines, "none": alone}))
+    driven = pd.concat([table, alone]).drop_duplicates("programme_s").sort_values("programme_s")
+    every = interp1d(driven["programme_s"], driven[[f"q{i}" for i in range(1, 7)]], axis=0)
+    s_s = table["programme_s"].to_numpy()
+    rows = np.searchsorted(table["t_ns"].to_numpy(), found.t_ns, side="right") - 1
+    ends_s = s_s[rows] + np.gradient(s_s, table["t_ns"].to_numpy() * 1e-9)[rows] * 0.1
+    np.testing.assert_allclose(found.methods["scaling"].stop_q, every(ends_s), atol=1e-9)
+
+
 def test_the_list_of_stops_has_each_once() -> None:
     run = moving_run(8.0)
     assert run.motion is not None
@@ -207,6 +223,24 @@ def test_a_small_budget_costs_the_volumes_their_rate_and_nothing_else(scene: Rep
     none = json.loads(replay_data(scene, budget_bytes=motion_bytes)[0])
     assert none["volumes"]["rate_hz"] is None
     assert none["volumes"]["at_s"] == []
+
+
+def test_hulls_that_are_stored_a_few_at_a_time_give_the_same_block(
+    scene: ReplayScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = replay_data(scene)
+    monkeypatch.setattr(replay_page, "_TOGETHER", 5)
+    assert replay_data(scene) == whole
+    far = dataclasses.replace(
+        scene, volumes=dataclasses.replace(scene.volumes, vertices_m=scene.volumes.vertices_m * 50.0)
+    )
+    text, numbers = replay_data(far)
+    header = json.loads(text)
+    entry = header["volumes"]["entries"]["vertices"]
+    assert entry["unit"] == pytest.approx(np.abs(far.volumes.vertices_m).max() / 32767)
+    hulls = zlib.decompress(base64.b64decode(numbers)[header["bytes"][0] :])
+    largest = np.abs(unpacked(header, entry, hulls)).max()
+    assert largest == pytest.approx(np.abs(far.volumes.vertices_m).max(), rel=1e-4)
 
 
 def test_the_same_run_gives_the_same_block() -> None:

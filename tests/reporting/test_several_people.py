@@ -12,10 +12,12 @@ import pandas as pd
 import pytest
 
 from hrcreplay.human.model import PARTS
+from hrcreplay.records import RECORDED
 from hrcreplay.reporting.figures import catalogue
 from hrcreplay.reporting.figures.catalogue import FigureData
 from hrcreplay.reporting.figures.prediction import skeleton_at, skeletons_at
-from hrcreplay.reporting.metrics.people import most_tracked, named_volumes
+from hrcreplay.reporting.metrics.people import add_people, most_tracked, named_volumes
+from hrcreplay.reporting.metrics.series import MetricTable
 from hrcreplay.reporting.page import report_page
 from hrcreplay.reporting.page.replay_page import replay_data, snapshot, solids
 from hrcreplay.reporting.replay_scene import SHOWN_POINTS
@@ -181,6 +183,31 @@ def test_figures_of_one_person_are_those_of_who_was_there_longest() -> None:
     run = replace(run, state=longer)
     assert most_tracked(run, 2) == (1, 7)
     assert most_tracked(run, 20) == run.people
+
+
+def test_each_person_is_held_by_the_volumes_of_the_chosen_method_also_beside_a_recorded_robot() -> None:
+    """The recorded robot comes first in the list of methods, and used no volumes."""
+    run = two_people(moving_run(4.0))
+    parts = []
+    for k, method in enumerate((RECORDED, "scaling", "qp")):
+        left_m = [0.0, 0.0, 0.01, np.nan] if method == "qp" else [np.nan] * 4
+        columns: dict[str, Any] = {"t_ns": np.arange(4), "method": method, "moving": [True, True, False, True]}
+        for number in (1, 2):
+            columns |= {
+                f"person_{number}_m": np.array([0.3, -0.01, -0.5, 0.2]) * number + 0.001 * k,
+                f"left_person_{number}_m": np.array(left_m) * (number - 1),
+                f"left_full_person_{number}_m": left_m,
+            }
+        parts.append(pd.DataFrame(columns))
+    table = MetricTable()
+    add_people(table, replace(run, contact=pd.concat(parts, ignore_index=True), recorded=run.baselines["scaling"]))
+    found = {name: metric["value"] for name, metric in table.sorted().items()}
+    assert found["person_1_volumes_held_share"] == 1.0
+    assert found["person_2_volumes_held_share"] == found["person_1_volumes_full_held_share"] == pytest.approx(2 / 3)
+    assert found["person_2_volumes_checked_ticks"] == 3
+    for prefix, more in ((RECORDED, 0.0), ("baseline_scaling", 0.001), ("plan", 0.002)):
+        assert found[f"{prefix}_person_2_distance_min_moving_m"] == pytest.approx(-0.02 + more)
+        assert found[f"{prefix}_person_1_touch_ticks"] == 1
 
 
 def test_the_verdict_names_each_of_few_people_and_the_least_held_of_many() -> None:

@@ -6,13 +6,15 @@ import subprocess
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 from hrcreplay.errors import SettingsError
+from hrcreplay.records import JOINTS
 from hrcreplay.store import run_folder
-from hrcreplay.store.run_folder import TableWriter
+from hrcreplay.store.run_folder import Run, TableWriter
 from tests.facts import facts
 
 
@@ -161,3 +163,14 @@ def test_a_column_that_comes_late_is_added_one_group_of_rows_at_a_time(
     with pq.ParquetFile(tmp_path / "late.parquet") as file:
         assert file.metadata.num_rows == 100
         assert file.read()["person"].to_pylist() == [1] * 92 + [2] * 8
+
+
+def test_a_person_is_known_where_all_joints_are(tmp_path: Path) -> None:
+    table = pd.DataFrame({"t_ns": np.arange(6), "person": [1, 2, 1, 2, 1, 2]} | dict.fromkeys(JOINTS, 0.5))
+    table.loc[1, JOINTS[3]], table.loc[4, JOINTS[-1]] = np.nan, np.inf
+    run = Run(tmp_path, {}, state=table)
+    assert run.known.tolist() == [True, False, True, True, False, True]
+    assert run.of_person(1).known.tolist() == [True, True, False]
+    assert run.of_person(2).known.tolist() == [False, True, True]
+    assert run.of_person(2) is run.of_person(2), "what it found is found once"
+    assert Run(tmp_path, {}).known.tolist() == []

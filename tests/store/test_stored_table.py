@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from hrcreplay.store import stored_table
-from hrcreplay.store.stored_table import RunTable, StoredTable, number_columns, text_column
+from hrcreplay.store.stored_table import RunTable, StoredTable, in_parts, number_columns, text_column
 
 N, GROUP = 1000, 64
 
@@ -72,6 +72,35 @@ def test_a_mask_of_few_groups_reads_the_same_as_one_of_all(tables: tuple[StoredT
     for first, last in ((0, 10), (60, 70), (500, 640), (0, N), (N - 1, N)):
         mask = (np.arange(N) >= first) & (np.arange(N) < last)
         same(stored[mask], frame[mask])
+
+
+def test_the_parts_of_a_table_follow_each_other(tables: tuple[StoredTable, pd.DataFrame]) -> None:
+    stored, frame = tables
+    few, none = (np.arange(N) % 5 == 0) & (np.arange(N) > 400), np.zeros(N, dtype=np.bool_)
+    names = ["moving", "distance_m"]
+    for table, whole in ((stored, frame), (stored[few], frame[few]), (stored[none], frame[none]), (frame, frame)):
+        parts = list(in_parts(table, names))
+        assert all(list(part.columns) == names for part in parts)
+        assert max(map(len, parts)) <= (len(frame) if isinstance(table, pd.DataFrame) else 3 * GROUP)
+        pd.testing.assert_frame_equal(pd.concat(parts, ignore_index=True), whole[names].reset_index(drop=True))
+    for table, absent in ((stored, "link"), (stored.assign(limb="HD"), "limb"), (frame, "link")):
+        with pytest.raises(KeyError, match=absent):
+            list(in_parts(table, ["moving", absent]))
+
+
+def test_columns_of_a_long_run_leave_nothing_freed_behind(
+    tables: tuple[StoredTable, pd.DataFrame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stored, frame = tables
+    given_back: list[int] = []
+    monkeypatch.setattr(stored_table, "release_freed_memory", lambda: given_back.append(1))
+    monkeypatch.setattr(stored_table, "_LAST", stored_table._LastColumns())
+    assert stored["t_ns"].tolist() == frame["t_ns"].tolist()
+    assert not given_back
+    monkeypatch.setattr(stored_table, "_LONG_BYTES", 8 * N - 1)
+    for _ in range(2):  # the second time it is kept
+        assert stored["person"].tolist() == frame["person"].tolist()
+        assert len(given_back) == 1
 
 
 def test_rows_by_their_places(tables: tuple[StoredTable, pd.DataFrame]) -> None:

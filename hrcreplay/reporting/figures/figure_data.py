@@ -5,7 +5,7 @@ Corrected equations: docs/paper.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -45,7 +45,7 @@ def compute_fields(run_config: RunConfig, run: Run, number: int, fields: Iterabl
         fields: Names of the fields.
     """
     wanted, one = [name for name in dict.fromkeys(fields) if name], run.of_person(number)
-    people = _states(run_config, one) if wanted else None
+    people = _states(run_config, one, wanted) if wanted else None
     if people is None:
         return {}
     own = people.of_person(number)
@@ -243,20 +243,26 @@ def _fastest_ns(run: Run, span_s: float) -> int | None:
     known_ns = find_known_ticks(run)
     if run.state is None or not len(known_ns):
         return None
-    place = run.state[["x", "y"]].to_numpy(dtype=float)[np.isin(times(run.state), known_ns)]
     span_ns = round(span_s * 1e9)
     later = np.searchsorted(known_ns, known_ns + span_ns, side="right") - 1
+    squares = np.zeros(len(known_ns))
+    for axis in "xy":
+        place = numeric_column(run.state, axis)[run.known]
+        squares += (place[later] - place) ** 2
     whole = known_ns[later] - known_ns >= 0.9 * span_ns
-    far = np.where(whole, np.linalg.norm(place[later] - place, axis=1), -1.0)
-    return int(known_ns[int(np.argmax(far))])
+    return int(known_ns[int(np.argmax(np.where(whole, np.sqrt(squares), -1.0)))])
 
 
-def _states(run_config: RunConfig, run: Run) -> HumanStates | None:
-    """Reads the fused people at all ticks that the figures of one of them need, once; None without a person."""
+def _states(run_config: RunConfig, run: Run, fields: Sequence[str]) -> HumanStates | None:
+    """Reads the fused people at all ticks that some fields of one of them need, once; None without a person."""
     if run.state is None:
         return None
-    wanted_ns = [*instants(run).tolist(), moment_ns(run), _fastest_ns(run, run_config.settings.prediction.stop_s)]
-    if run.motion is not None and len(run.motion):
+    wanted_ns: list[int | None] = instants(run).tolist() if "instants" in fields else []
+    if "sweep" in fields or "growth" in fields:
+        wanted_ns.append(moment_ns(run))
+    if "walk" in fields:
+        wanted_ns.append(_fastest_ns(run, run_config.settings.prediction.stop_s))
+    if "pose" in fields and run.motion is not None and len(run.motion):
         wanted_ns.append(int(times(run.motion)[nearest_tick(run.motion)]))
     known_ns = np.array([t for t in wanted_ns if t is not None], dtype=np.int64)
     return read_states_at(run.folder / "state.parquet", known_ns)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import chain
 from typing import Any
@@ -18,13 +18,15 @@ from hrcreplay.reporting.figures import drawing
 from hrcreplay.reporting.figures.prediction import Limbs, stored_at
 from hrcreplay.reporting.figures.scene import ABOVE, View, bounds_of, draw_outlines, view_from
 from hrcreplay.reporting.metrics.planning import numeric_column, position_columns, stationary
-from hrcreplay.reporting.metrics.series import Metric, envelope, path_feet, seconds_from, thin_path, times, true_runs
+from hrcreplay.reporting.metrics.series import Metric, envelope, feet_in_turn, seconds_from, thin_path, times, true_runs
 from hrcreplay.reporting.tables import share_text
-from hrcreplay.store.stored_table import RunTable
+from hrcreplay.store.stored_table import RunTable, in_parts
 
 SIDE = view_from(-0.5 * np.pi, 0.0)
 #: Time before and after the largest deviation in which the path is drawn in bold [s].
 _PASS_S = 2.0
+#: Motion between two drawn points of a path [m].
+_THIN_M = 0.004
 #: Minimum deviation [m].
 SHORTEST_M = 0.5e-3
 
@@ -45,11 +47,14 @@ class Deviation:
 
 def largest_deviation(motion: RunTable) -> Deviation:
     """Finds the largest distance between the TCP and the programmed path."""
-    reference, tcp = position_columns(motion, "ref"), position_columns(motion, "tcp")
-    feet = path_feet(tcp, reference)
-    far = np.linalg.norm(tcp - feet, axis=1)
-    row = int(np.argmax(np.where(np.isfinite(far), far, -1.0)))
-    return Deviation(row, tcp[row], feet[row])
+    tcp = position_columns(motion, "tcp")
+    worst, worst_m = Deviation(0, tcp[0], np.full(3, np.nan)), -1.0
+    for rows, feet in feet_in_turn(tcp, position_columns(motion, "ref")):
+        far_m = np.linalg.norm(tcp[rows] - feet, axis=1)
+        k = int(np.argmax(far_m))
+        if far_m[k] > worst_m:
+            worst, worst_m = Deviation(int(rows[k]), tcp[rows[k]], feet[k]), float(far_m[k])
+    return worst
 
 
 def path(
@@ -75,10 +80,10 @@ def path(
     figure = drawing.column_figure(2.45)
     (above, side), *_ = drawing.column_panels(figure, 1, 2, bottom_in=0.62)
     base = np.zeros((0, 3)) if T_world_base is None else T_world_base[None, :3, 3]
+    ways = _Ways.of(motion, worst)
     for ax, view in ((above, ABOVE), (side, SIDE)):
-        _draw_path(ax, view, motion, limbs, worst)
-        paths = (view.flat(position_columns(motion, what)) for what in ("ref", "tcp"))  # one by one: they may be long
-        low, high = bounds_of(chain(paths, [view.flat(base)]), 0.08)
+        _draw_path(ax, view, ways, limbs, worst)
+        low, high = bounds_of(chain(_flat(motion, "ref", view), _flat(motion, "tcp", view), [view.flat(base)]), 0.08)
         drawing.set_window(ax, low.tolist(), high.tolist())
         if T_world_base is not None:
             ax.plot(*view.flat(T_world_base[None, :3, 3]).T, "s", color=drawing.INK, ms=4, zorder=3)
@@ -105,15 +110,14 @@ def deviation(motion: RunTable, occupancy: RunTable | None, t0_ns: int, worst: D
     away = worst.at_m - worst.foot_m
     view = view_from(float(np.arctan2(away[1], away[0]) - 0.5 * np.pi), 0.0)
     ends = view.flat(np.vstack([worst.foot_m, worst.at_m]))
-    _draw_path(ax, view, motion, limbs, worst)
+    _draw_path(ax, view, _Ways.of(motion, worst), limbs, worst)
     low, high = bounds_of([ends], 0.4 * worst.length_m + 0.06)
     drawing.set_window(ax, low.tolist(), high.tolist())
     at = f"At {(int(times(motion)[worst.row]) - t0_ns) * 1e-9:.1f} s"
     ax.set(title=at, xlabel="in the vertical plane of the deviation [m]", ylabel="z [m]")
-    tcp = view.flat(position_columns(motion, "tcp"))
-    _label_length(
-        ax, ends, f"{worst.length_m:.3f} m", tcp[np.linalg.norm(tcp - ends.mean(axis=0), axis=1) < worst.length_m]
-    )
+    parts, middle = _flat(motion, "tcp", view), ends.mean(axis=0)
+    crowd = np.concatenate([tcp[np.linalg.norm(tcp - middle, axis=1) < worst.length_m] for tcp in parts])
+    _label_length(ax, ends, f"{worst.length_m:.3f} m", crowd)
     _path_legend(figure, with_limbs=bool(limbs), with_base=False)
     return figure
 
@@ -157,14 +161,34 @@ def _limbs_at(occupancy: RunTable | None, motion: RunTable, worst: Deviation) ->
     return stored_at(occupancy, t_ns)[1]
 
 
-def _draw_path(ax: Axes, view: View, motion: RunTable, limbs: Limbs, worst: Deviation) -> None:
-    reference, tcp = position_columns(motion, "ref"), position_columns(motion, "tcp")
+@dataclass(frozen=True)
+class _Ways:
+    """The paths as they are drawn, with few of their points [m]."""
+
+    programmed: Floats  #: (m, 3)
+    driven: Floats  #: (k, 3)
+    then: Floats  #: (i, 3) driven around the time of the largest deviation
+
+    @classmethod
+    def of(cls, motion: RunTable, worst: Deviation) -> _Ways:
+        """Thins those of a motion, one after the other: they may be long."""
+        programmed = thin_path(position_columns(motion, "ref"), _THIN_M)
+        driven = position_columns(motion, "tcp")
+        then = np.abs(seconds_from(times(motion), int(times(motion)[worst.row]))) <= _PASS_S
+        return cls(programmed, thin_path(driven, _THIN_M), thin_path(driven[then], _THIN_M))
+
+
+def _flat(motion: RunTable, what: str, view: View) -> Iterator[Floats]:
+    """Yields the ``ref`` or ``tcp`` positions (n, 2) in a view, some after the others [m]."""
+    for part in in_parts(motion, [f"{what}_{axis}" for axis in "xyz"]):
+        yield view.flat(part.to_numpy(dtype=float))
+
+
+def _draw_path(ax: Axes, view: View, ways: _Ways, limbs: Limbs, worst: Deviation) -> None:
     draw_outlines(ax, limbs, view)
-    seconds = seconds_from(times(motion), int(times(motion)[worst.row]))
-    then = np.abs(seconds) <= _PASS_S
-    ax.plot(*view.flat(thin_path(tcp, 0.004)).T, color=drawing.ACTUAL, lw=0.5, alpha=0.35, zorder=4)
-    ax.plot(*view.flat(thin_path(reference, 0.004)).T, color=drawing.NOMINAL, lw=1.8, zorder=5)
-    ax.plot(*view.flat(thin_path(tcp[then], 0.004)).T, color=drawing.ACTUAL, lw=1.0, zorder=6)
+    ax.plot(*view.flat(ways.driven).T, color=drawing.ACTUAL, lw=0.5, alpha=0.35, zorder=4)
+    ax.plot(*view.flat(ways.programmed).T, color=drawing.NOMINAL, lw=1.8, zorder=5)
+    ax.plot(*view.flat(ways.then).T, color=drawing.ACTUAL, lw=1.0, zorder=6)
     ends = view.flat(np.vstack([worst.foot_m, worst.at_m]))
     ax.plot(*ends.T, color=drawing.INK, lw=0.9, ls=(0, (2, 1)), zorder=7)
     ax.plot(*ends[0], "o", color=drawing.NOMINAL, ms=3.5, zorder=7)

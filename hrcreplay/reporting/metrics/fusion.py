@@ -49,7 +49,7 @@ def add_quality(metrics: MetricTable, run: Run, gap_s: float) -> None:
         _add_heights(metrics, run.bodies, camera)
     add_agreement(metrics, run.agreement)
     if run.state is not None:
-        _add_coverage(metrics, run.state)
+        _add_coverage(metrics, run.state, run.known)
         fresh_s = run.meta.get("settings", {}).get("fusion", {}).get("fresh_s")
         _add_known(metrics, run.state, fresh_s)
     _add_watched(metrics, run)
@@ -143,7 +143,7 @@ def seconds_since(state: RunTable, valid: Bools) -> Floats:
     return np.where(last < 0, np.inf, (t_ns - t_ns[np.maximum(last, 0)]) * 1e-9)
 
 
-def _add_coverage(metrics: MetricTable, state: RunTable) -> None:
+def _add_coverage(metrics: MetricTable, state: RunTable, finite: Bools) -> None:
     names = [name for name in state.columns if name.startswith("valid_")]
     any_valid: Bools = np.asarray(state[names].to_numpy(dtype=bool).any(axis=1))
     t_ns = times(state)
@@ -157,8 +157,6 @@ def _add_coverage(metrics: MetricTable, state: RunTable) -> None:
         "s",
         "longest stretch of ticks whose updates used no camera at all, including the time before the first frame",
     )
-    p = columns(state)
-    finite: Bools = np.asarray(np.isfinite(p).all(axis=1))
     lost = ~finite
     lost[: int(np.argmax(finite)) if finite.any() else len(lost)] = False
     metrics.add("ticks_before_first_state", int((~finite).sum() - lost.sum()), "1", "ticks before the first full state")

@@ -50,16 +50,14 @@ def add_people(metrics: MetricTable, run: Run) -> None:
     metrics.add(
         "bodies_seen_briefly", brief, "1", "bodies seen too briefly for that: they counted by their points alone"
     )
+    prefixes, contact = method_prefixes(run), run.contact
+    by_method = {} if contact is None else {method: contact[contact["method"] == method] for method in prefixes}
     for number in run.people:
-        rows = run.state[run.state["person"] == number]
-        _add_times(metrics, number, rows, run.state)
-        if run.contact is not None:
-            own = run.contact[run.contact["method"] == next(iter(method_prefixes(run)))]
-            _add_held(metrics, number, own)
-            for method, prefix in method_prefixes(run).items():
-                _add_distance(
-                    metrics, f"{prefix}_person_{number}", run.contact[run.contact["method"] == method], number
-                )
+        _add_times(metrics, number, run.state[run.state["person"] == number], run.state)
+        for method, rows in by_method.items():
+            if prefixes[method] == "plan":
+                _add_held(metrics, number, rows)
+            _add_distance(metrics, f"{prefixes[method]}_person_{number}", rows, number)
 
 
 def _add_times(metrics: MetricTable, number: int, rows: RunTable, state: RunTable) -> None:

@@ -16,7 +16,7 @@ import pandas as pd
 
 from hrcreplay.geometry.polyline import advance_foot
 from hrcreplay.records import RECORDED, STATUSES, Bools, Floats, Ints
-from hrcreplay.reporting.metrics.series import MetricTable, durations_s, path_feet, step_lengths, times, way_along
+from hrcreplay.reporting.metrics.series import MetricTable, durations_s, feet_in_turn, step_lengths, times, way_along
 from hrcreplay.robot.recorded import UNKNOWN
 from hrcreplay.store.stored_table import RunTable, number_columns, text_column
 
@@ -149,8 +149,18 @@ def is_moving(motion: RunTable, slow_m_per_s: float) -> Bools:
 
 def deviation_m(motion: RunTable) -> Floats:
     """(n,) distance of the TCP from the programmed path [m]."""
-    tcp = position_columns(motion, "tcp")
-    return np.asarray(np.linalg.norm(tcp - path_feet(tcp, position_columns(motion, "ref")), axis=1))
+    tcp, found = position_columns(motion, "tcp"), np.full(len(motion), np.nan)
+    for rows, feet in feet_in_turn(tcp, position_columns(motion, "ref")):
+        found[rows] = np.linalg.norm(tcp[rows] - feet, axis=1)
+    return found
+
+
+def tracking_error_m(motion: RunTable) -> Floats:
+    """(n,) distance of the TCP from the reference of the same tick [m]."""
+    squares = np.zeros(len(motion))
+    for axis in "xyz":
+        squares += (numeric_column(motion, f"tcp_{axis}") - numeric_column(motion, f"ref_{axis}")) ** 2
+    return np.sqrt(squares, out=squares)
 
 
 def waited_s(motion: RunTable) -> Floats:
@@ -375,11 +385,11 @@ def _add_stationary(metrics: MetricTable, prefix: str, motion: RunTable, what: s
 
 
 def _add_path(metrics: MetricTable, prefix: str, motion: RunTable, what: str) -> None:
-    along = np.linalg.norm(position_columns(motion, "tcp") - position_columns(motion, "ref"), axis=1)
-    for name, values, meaning in (
-        ("deviation", deviation_m(motion), "distance from the TCP to the nearest point of the programmed path"),
-        ("tracking_error", along, "distance from the TCP to the reference of the same tick"),
+    for name, measure, meaning in (
+        ("deviation", deviation_m, "distance from the TCP to the nearest point of the programmed path"),
+        ("tracking_error", tracking_error_m, "distance from the TCP to the reference of the same tick"),
     ):
+        values = measure(motion)
         values = values[np.isfinite(values)]
         for kind, number in (("mean", np.mean), ("p95", _p95), ("max", np.max)):
             value = float(number(values)) if len(values) else None

@@ -5,6 +5,7 @@ A metric has a value, a unit and a meaning; one that does not apply is null with
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -195,24 +196,23 @@ _CELL_M, _SAME_M = 2e-4, 1e-6
 _TOGETHER = 65_536
 
 
-def path_feet(points: Floats, path: Floats) -> Floats:
-    """Returns (n, 3) nearest points on a (m, 3) polyline for (n, 3) points, all in one frame [m].
+def feet_in_turn(points: Floats, path: Floats) -> Iterator[tuple[Ints, Floats]]:
+    """Yields rows of (n, 3) points and the nearest points to them on a (m, 3) polyline, all in one frame [m].
 
-    Searches the two segments at the nearest vertex, which is exact if vertices are dense relative to the curvature.
+    Rows with an unknown point are left out. Searches the two segments at the nearest vertex, which is exact if vertices
+    are dense relative to the curvature.
     """
-    path = np.ascontiguousarray(thin_path(path[np.isfinite(path).all(axis=1)], _SAME_M))
-    feet = np.full(points.shape, np.nan)
-    known = np.isfinite(points).all(axis=1)
-    if not len(path) or not known.any():
-        return feet
-    rows, vertices = np.flatnonzero(known), _vertices_apart(path)
+    known, rows = np.isfinite(path).all(axis=1), np.flatnonzero(np.isfinite(points).all(axis=1))
+    path = np.ascontiguousarray(thin_path(path if known.all() else path[known], _SAME_M))
+    if not len(path) or not len(rows):
+        return
+    vertices = _vertices_apart(path)
     for first in range(0, len(rows), _TOGETHER):
         some = rows[first : first + _TOGETHER]
         at = np.ascontiguousarray(points[some])
         nearest = vertices[nearest_vertices(at, path[vertices])]
         follow_nearer(at, path, nearest)
-        feet[some] = _feet_beside(at, path, nearest)
-    return feet
+        yield some, _feet_beside(at, path, nearest)
 
 
 def _feet_beside(at: Floats, path: Floats, nearest: Ints) -> Floats:
@@ -263,12 +263,7 @@ def start_ns(run: Run) -> int:
 
 def find_known_ticks(run: Run) -> Ints:
     """Returns the ticks at which the person is known [ns]."""
-    if run.state is None:
-        return np.zeros(0, dtype=np.int64)
-    known = np.ones(len(run.state), dtype=np.bool_)
-    for joint in JOINTS:
-        known &= np.isfinite(run.state[joint].to_numpy(dtype=float))
-    return times(run.state)[known]
+    return np.zeros(0, dtype=np.int64) if run.state is None else times(run.state)[run.known]
 
 
 def moment_ns(run: Run) -> int | None:

@@ -142,6 +142,8 @@ _LARGEST = 32767
 #: Maximum size of the block in base64 [bytes]; the volumes are stored at the highest of these rates that fits.
 BUDGET_BYTES = 9_000_000
 VOLUME_RATES_HZ = (VOLUME_HZ, LONG_VOLUME_HZ, 2.5, 1.0, 0.5, 0.2)
+#: Number of hulls that are sorted together: those of a long run would be in memory five times.
+_TOGETHER = 4096
 #: Minimum share to which hulls are usually deflated.
 _AT_BEST = 0.3
 
@@ -161,27 +163,34 @@ class NumberBlock:
         If a value is too large for 16 bits, the step is increased.
         """
         table = np.asarray(values).reshape(len(values), math.prod(values.shape[1:]))
-        largest = max((float(np.abs(column[np.isfinite(column)]).max(initial=0.0)) for column in table.T), default=0.0)
-        unit = max(unit, largest / _LARGEST)
+        unit = max(unit, _largest(table) / _LARGEST)
+        self.add_counts(name, np.column_stack([_counts(column, unit) for column in table.T]), unit)
+
+    def add_counts(self, name: str, counts: NDArray[np.int16], unit: float) -> None:
+        """Adds counts (n, k) of steps, or ``MISSING``; ``unit`` is the step of one count."""
         low, high = bytearray(), bytearray()
-        for column in table.T:
-            steps = _steps(column, unit)
+        for column in counts.T:
+            steps = np.diff(column.astype(np.int32), prepend=0).astype(np.uint16)  # modulo 2^16
             low += (steps & 0xFF).astype(np.uint8).tobytes()
             high += (steps >> 8).astype(np.uint8).tobytes()
         self._packed += self._stream.compress(low) + self._stream.compress(high)
-        self.entries[name] = {"at": self._at, "rows": len(table), "columns": table.shape[1], "unit": unit}
-        self._at += 2 * table.size
+        self.entries[name] = {"at": self._at, "rows": len(counts), "columns": counts.shape[1], "unit": unit}
+        self._at += 2 * counts.size
 
     def deflated(self) -> bytes:
         """Returns the whole block as a zlib stream."""
         return bytes(self._packed) + self._stream.copy().flush()
 
 
-def _steps(column: NDArray[Any], unit: float) -> NDArray[np.uint16]:
-    """Returns (n,) differences of a column's counts, modulo 2^16."""
-    finite = np.isfinite(column)
-    counts = np.where(finite, np.round(np.where(finite, column, 0.0) / unit), MISSING).astype(np.int32)
-    return np.diff(counts, prepend=0).astype(np.uint16)
+def _largest(table: NDArray[Any]) -> float:
+    """Returns the largest finite size of the numbers in a table (n, k); 0 without one."""
+    return max((float(np.abs(column[np.isfinite(column)]).max(initial=0.0)) for column in table.T), default=0.0)
+
+
+def _counts(table: NDArray[Any], unit: float) -> NDArray[np.int16]:
+    """Returns how many steps of ``unit`` each number has; ``MISSING`` for NaN."""
+    finite = np.isfinite(table)
+    return np.where(finite, np.round(np.where(finite, table, 0.0) / unit), MISSING).astype(np.int16)
 
 
 def replay_data(scene: ReplayScene, *, budget_bytes: int = BUDGET_BYTES) -> tuple[str, str]:
@@ -202,12 +211,12 @@ def replay_data(scene: ReplayScene, *, budget_bytes: int = BUDGET_BYTES) -> tupl
         _add_track(block, name, track)
     motion = block.deflated()
     left = budget_bytes * 3 // 4 - len(motion)
-    volumes, hulls, rate_hz = _volumes_within(scene.volumes, left)
+    volumes, rows, rate_hz = _volumes_within(scene.volumes, left)
     header["volumes"] = {
         "limbs": list(scene.volumes.limbs),
         "limb_names": [part_name_text(limb) for limb in scene.volumes.limbs],
         "rate_hz": rate_hz,
-        "at_s": [round(at_s, 4) for at_s in seconds_from(hulls.t_ns, scene.t0_ns).tolist()],
+        "at_s": [round(at_s, 4) for at_s in seconds_from(scene.volumes.t_ns[rows], scene.t0_ns).tolist()],
         "entries": volumes.entries,
     }
     header["entries"] = block.entries
@@ -295,32 +304,37 @@ def _add_track(block: NumberBlock, name: str, track: MethodTrack) -> None:
         block.add(f"{name}/{kind}", index)
 
 
-def _volumes_within(volumes: VolumeTrack, left: int) -> tuple[NumberBlock, VolumeTrack, float | None]:
-    """Returns the volumes at the highest rate that fits into a number of deflated bytes; None: at no rate."""
+def _volumes_within(volumes: VolumeTrack, left: int) -> tuple[NumberBlock, Ints, float | None]:
+    """Returns the volumes at the highest rate that fits into a number of deflated bytes, and their rows; None: none."""
     counts = np.diff(volumes.offsets)
     for rate_hz in [rate_hz for rate_hz in VOLUME_RATES_HZ if len(volumes.t_ns) and rate_hz <= volumes.rate_hz]:
         rows = at_rate(volumes.t_ns, rate_hz)
         if _AT_BEST * 6 * counts[rows].sum() > left:
             continue
-        hulls = volumes.rows(rows)
-        block = _hulls(hulls)
+        block = _hulls(volumes, rows)
         if len(block.deflated()) <= left:
-            return block, hulls, rate_hz
-    nothing = volumes.rows(np.zeros(0, np.int64))
-    return _hulls(nothing), nothing, None
+            return block, rows, rate_hz
+    nothing = np.zeros(0, np.int64)
+    return _hulls(volumes, nothing), nothing, None
 
 
-def _hulls(hulls: VolumeTrack) -> NumberBlock:
-    """Sorts the vertices of each hull by height, so that their differences are small."""
-    block = NumberBlock()
-    owner = np.repeat(np.arange(len(hulls.t_ns)), np.diff(hulls.offsets))
-    order = np.lexsort((hulls.vertices_m[:, 0], hulls.vertices_m[:, 1], hulls.vertices_m[:, 2], owner))
-    block.add("vertices", hulls.vertices_m[order], 1e-3)
-    block.add("limb", hulls.limb)
-    block.add("count", np.diff(hulls.offsets))
-    block.add("radius", hulls.radius_m, 1e-3)
-    block.add("horizon", hulls.horizon_s, 1e-3)
+def _hulls(volumes: VolumeTrack, rows: Ints) -> NumberBlock:
+    """Stores some hulls, the vertices of each by height, so that their differences are small."""
+    block, some = NumberBlock(), [rows[first : first + _TOGETHER] for first in range(0, len(rows), _TOGETHER)]
+    unit = max(1e-3, max((_largest(volumes.rows(few).vertices_m) for few in some), default=0.0) / _LARGEST)
+    vertices = [_counts(_by_height(volumes.rows(few)), unit) for few in some]
+    block.add_counts("vertices", np.concatenate([np.zeros((0, 3), np.int16), *vertices]), unit)
+    block.add("limb", volumes.limb[rows])
+    block.add("count", np.diff(volumes.offsets)[rows])
+    block.add("radius", volumes.radius_m[rows], 1e-3)
+    block.add("horizon", volumes.horizon_s[rows], 1e-3)
     return block
+
+
+def _by_height(hulls: VolumeTrack) -> Floats:
+    """Returns the vertices (m, 3), those of each hull by height [m]."""
+    owner = np.repeat(np.arange(len(hulls.t_ns)), np.diff(hulls.offsets))
+    return hulls.vertices_m[np.lexsort((*hulls.vertices_m.T, owner))]
 
 
 _ROBOT, _PERSON, _TOUCH = "#d9823b", "#7fb2d9", "#c62828"
