@@ -160,6 +160,7 @@ def complete(
     if log.header.joint_topics or meta["counts"].get("joint_gaps_ms"):
         meta["programme"] = "task" if run_config.task or log.header.task else "recorded joints"
     writer.close_tables()
+    release_freed_memory()
     meta |= _describe_results(run_config, log, writer.partial, meta, meta["notes"])
     for line in defect_notes(meta["counts"], meta["notes"]):
         print_note(line)

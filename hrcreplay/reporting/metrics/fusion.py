@@ -27,7 +27,7 @@ from hrcreplay.reporting.metrics.series import (
 from hrcreplay.reporting.tables import LIMB_NAMES
 from hrcreplay.settings.sections import setting
 from hrcreplay.store.run_folder import Run
-from hrcreplay.store.stored_table import RunTable
+from hrcreplay.store.stored_table import RunTable, number_columns
 
 
 def cameras(run: Run) -> list[str]:
@@ -451,7 +451,7 @@ def add_limbs(metrics: MetricTable, run: Run) -> None:
     shares = np.full(len(LIMBS), np.nan)
     memory_s = float(setting(run.meta.get("settings", {}), "fusion", "memory_s"))
     if run.state is not None and set(names) <= set(run.state.columns):
-        shares = unmeasured_shares(run.state[names].to_numpy(dtype=float), memory_s)
+        shares = unmeasured_shares(number_columns(run.state, names), memory_s)
     never = _never_measured(run.measurements)
     for limb, share in zip(LIMBS, shares.tolist(), strict=True):
         metrics.add(

@@ -170,7 +170,8 @@ class NumberBlock:
         """Adds counts (n, k) of steps, or ``MISSING``; ``unit`` is the step of one count."""
         low, high = bytearray(), bytearray()
         for column in counts.T:
-            steps = np.diff(column.astype(np.int32), prepend=0).astype(np.uint16)  # modulo 2^16
+            steps = np.array(column).view(np.uint16)
+            steps[1:] -= np.ascontiguousarray(column[:-1]).view(np.uint16)  # modulo 2^16
             low += (steps & 0xFF).astype(np.uint8).tobytes()
             high += (steps >> 8).astype(np.uint8).tobytes()
         self._packed += self._stream.compress(low) + self._stream.compress(high)
@@ -322,10 +323,15 @@ def _hulls(volumes: VolumeTrack, rows: Ints) -> NumberBlock:
     """Stores some hulls, the vertices of each by height, so that their differences are small."""
     block, some = NumberBlock(), [rows[first : first + _TOGETHER] for first in range(0, len(rows), _TOGETHER)]
     unit = max(1e-3, max((_largest(volumes.rows(few).vertices_m) for few in some), default=0.0) / _LARGEST)
-    vertices = [_counts(_by_height(volumes.rows(few)), unit) for few in some]
-    block.add_counts("vertices", np.concatenate([np.zeros((0, 3), np.int16), *vertices]), unit)
+    corners, first = np.diff(volumes.offsets)[rows], 0
+    vertices = np.empty((int(corners.sum()), 3), np.int16)
+    for few in some:
+        found = _counts(_by_height(volumes.rows(few)), unit)
+        vertices[first : first + len(found)] = found
+        first += len(found)
+    block.add_counts("vertices", vertices, unit)
     block.add("limb", volumes.limb[rows])
-    block.add("count", np.diff(volumes.offsets)[rows])
+    block.add("count", corners)
     block.add("radius", volumes.radius_m[rows], 1e-3)
     block.add("horizon", volumes.horizon_s[rows], 1e-3)
     return block
