@@ -97,7 +97,7 @@ def write_rows(every: Iterator[Columns], write: Callable[[Columns], None]) -> pd
     for rows in every:
         write(rows)
         met.append(arrow_table({name: rows[name] for name in MET}))
-    return pa.concat_tables(met).to_pandas()
+    return pa.concat_tables(met).to_pandas(split_blocks=True, self_destruct=True)
 
 
 @dataclass(frozen=True)

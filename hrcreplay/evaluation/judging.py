@@ -122,12 +122,19 @@ def write_contact(
     """
     with TemporaryDirectory(prefix=".people_", dir=writer.partial) as folder:
         people = read_recorded_people(run_config, log, writer, seen, Path(folder))
-        release_freed_memory()
-        _judge(_JudgedRun(run_config, T_world_base, people, writer.partial), log, writer, second)
+        judged = _JudgedRun(run_config, T_world_base, people, writer.partial)
+        found = _judge(judged, log, writer, second)
+    del people, judged  # in a long run many
+    release_freed_memory()
+    for rows, meetings in found:
+        writer.table("severity", meetings)
+        _move_rows(rows, writer)
+    writer.close_tables()
 
 
-def _judge(judged: _JudgedRun, log: Log, writer: RunWriter, second: Executor | None) -> None:
-    """Writes the tables of ``write_contact``."""
+def _judge(judged: _JudgedRun, log: Log, writer: RunWriter, second: Executor | None) -> list[tuple[Path, Columns]]:
+    """Writes the body, and the rows of contact of each motion to a file; returns these files and rows of severity."""
+    release_freed_memory()
     paths = sorted(writer.partial.glob("motion*.parquet"))
     coverages, there = judged.coverages, {}
     if second is not None:
@@ -145,13 +152,10 @@ def _judge(judged: _JudgedRun, log: Log, writer: RunWriter, second: Executor | N
         if path.stem == f"motion_{RECORDED}" and StoredTable(path)["q1"].isna().all():
             capsules, _ = assembly.recorded_capsules(log, judged.T_world_base)
         meetings[path] = judged.judge(path, capsules, coverages)
-    release_freed_memory()
-    for path in paths:
-        writer.table("severity", meetings[path] if path in meetings else there[path].result())
-        _move_rows(judged.rows_of(path), writer)
-    writer.close_tables()
+    meetings |= {path: judging.result() for path, judging in there.items()}
     if second is not None:
         second.submit(_forget_there)
+    return [(judged.rows_of(path), meetings[path]) for path in paths]
 
 
 def _write_body(judged: _JudgedRun, ticks_ns: Ints, writer: RunWriter) -> None:

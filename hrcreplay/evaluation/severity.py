@@ -31,7 +31,7 @@ from hrcreplay.records import Bools, Floats, Ints
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.recorded import RecordedCapsules
 from hrcreplay.store.columns import Columns
-from hrcreplay.store.stored_table import RunTable
+from hrcreplay.store.stored_table import RunTable, number_columns
 
 #: Two stretches of contact with a shorter gap are one contact [s].
 MERGED_S = 0.2
@@ -177,11 +177,13 @@ class Meeting:
             kind: CONTACT or NEAREST.
             motion: Rows of a motion table.
             contact: Rows of contact.parquet of the same ticks.
-            ticks: (k,) rows at which a body is known.
+            ticks: (k,) rows at which a body is known, increasing.
         """
         t_ns, source = contact["t_ns"].to_numpy()[ticks], contact["source"].iloc[ticks].to_numpy().astype(str)
-        names, there = [f"q{i + 1}" for i in range(self.robot.nv)], motion.iloc[ticks]
-        q, dq = (there[[f"{d}{name}" for name in names]].to_numpy(dtype=float) for d in ("", "d"))
+        here, names = np.zeros(len(motion), dtype=np.bool_), [f"q{i + 1}" for i in range(self.robot.nv)]
+        here[ticks] = True
+        touched = motion[here]
+        q, dq = (np.ascontiguousarray(number_columns(touched, [d + name for name in names])) for d in ("", "d"))
         for first in range(0, len(ticks), _BATCH):
             rows = slice(first, first + _BATCH)
             yield from self._impacts((method, kind), t_ns[rows], q[rows], dq[rows], source[rows])
