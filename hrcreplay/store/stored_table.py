@@ -244,8 +244,10 @@ class _File:
 
     def parts(self, names: list[str], rows: Bools | None) -> Iterator[pa.Table]:
         """Yields some columns, of all rows or of those (n,) that are True, of few groups of rows at a time."""
-        groups = self._groups(rows) or [0]
+        groups = self._groups(rows)
         with self._opened() as file:
+            if not groups:  # columns without rows
+                yield file.schema_arrow.empty_table().select(names)
             for k in range(0, len(groups), _GROUPS):
                 few = groups[k : k + _GROUPS]
                 table = file.read_row_groups(few, columns=names, use_threads=False)
@@ -261,6 +263,7 @@ class _File:
             with self._opened() as file:
                 table = file.read(columns=[name], use_threads=False)
             found = table.to_pandas(split_blocks=True, self_destruct=True)[name]
+            found.to_numpy().flags.writeable = False  # whoever asks next gets the same numbers
             _LAST.keep(id(self), name, found)
             if found.nbytes > _LONG_BYTES:
                 release_freed_memory()

@@ -103,6 +103,27 @@ def test_columns_of_a_long_run_leave_nothing_freed_behind(
         assert len(given_back) == 1
 
 
+def test_nobody_changes_a_column_that_is_kept(tables: tuple[StoredTable, pd.DataFrame]) -> None:
+    stored, frame = tables
+    for name in ("t_ns", "distance_m", "moving"):
+        with pytest.raises(ValueError, match="read-only"):
+            stored[name].to_numpy()[0] = 1
+        changed = stored[[name]]
+        changed.iloc[0, 0] = frame[name].iloc[1]
+        pd.testing.assert_series_equal(stored[name], frame[name])
+
+
+def test_parts_of_an_empty_table_have_its_columns(tmp_path: Path) -> None:
+    schema = pa.schema({"t_ns": pa.int64(), "x": pa.float64()})
+    pq.write_table(schema.empty_table(), tmp_path / "rows.parquet")
+    pq.ParquetWriter(tmp_path / "groups.parquet", schema).close()
+    for path in (tmp_path / "rows.parquet", tmp_path / "groups.parquet"):
+        parts = list(in_parts(StoredTable(path), ["x"]))
+        assert sum(map(len, parts)) == 0
+        assert all(list(part.columns) == ["x"] for part in parts)
+        assert len(StoredTable(path)["x"]) == 0
+
+
 def test_rows_by_their_places(tables: tuple[StoredTable, pd.DataFrame]) -> None:
     stored, frame = tables
     mask = frame["person"].to_numpy() == 2
