@@ -64,7 +64,7 @@ class Planner:
         while tick < len(t_ns):
             last = len(t_ns)
             if way is not None and outlook.ahead is not None:
-                done = self._run(way, outlook.how, outlook.ahead, columns, tick)
+                done = self._run(way, outlook.person.held, outlook.ahead, columns, tick)
                 patience = 1 if done > tick else min(2 * patience, _MOST_LEFT)
                 tick, last = done, min(done + patience, len(t_ns))
             for one in range(tick, last):
@@ -73,12 +73,12 @@ class Planner:
         links = tuple(segment.name for segment in self.robot.segments)
         return Motion(t_ns=t_ns, **columns._asdict(), limbs=limbs, links=links, reasons=REASONS)
 
-    def _run(self, way: Way, how: Held, people: PeopleAhead, columns: MotionColumns, tick: int) -> int:
+    def _run(self, way: Way, person: Held | None, people: PeopleAhead, columns: MotionColumns, tick: int) -> int:
         """Moves the robot in the kernel as far as it can from a tick on; returns the first tick that is not done."""
         own = self.controller
         if not way.by_qp and np.isnan(own.stop.along[0, 0]):
             return tick  # it continues the stop of another method
-        done, moving = run_ticks(own.scene, way, how, people, Moving(own.moment, own.point), columns, tick)
+        done, moving = run_ticks(own.scene, way, person, people, Moving(own.moment, own.point), columns, tick)
         (own.stop, own.u, own.s_s, _, own.planes), own.point = moving
         return done
 

@@ -11,7 +11,6 @@ import numpy as np
 from hrcreplay.human.fusion.vacancy import WatchedArea
 from hrcreplay.human.model import LimitSet
 from hrcreplay.human.prediction import swept_volumes
-from hrcreplay.kernels import Held
 from hrcreplay.pipeline.batch.ticks import KNOWN, LEFT, TOO_OLD, PeopleAhead, hulls_of
 from hrcreplay.records import BORDER, Bools, Floats, HumanStates, Ints, SweptVolumes, volume_name
 from hrcreplay.robot.control.border import Border
@@ -180,11 +179,10 @@ class Forecast:
         torso is out of sight, are left to Python.
         """
         person, states = self.person, self.states
-        if person.rows is None or self.around.watched is not None:
+        if person.held is None or self.around.watched is not None:
             return None
         by_hand = np.logical_or.reduceat(person.by_points | person.partly_seen, self._first[:-1])
         return PeopleAhead(
-            person.rows,
             self._first,
             np.array(states.numbers),  # a copy, which is not protected
             np.where(self._too_old, TOO_OLD, np.where(by_hand, LEFT, KNOWN)),
@@ -195,11 +193,6 @@ class Forecast:
     def _too_old(self) -> Bools:
         """(k,) true for ticks with somebody whose newest frame is too old."""
         return np.logical_or.reduceat(~(self.states.frame_age_s <= self.around.fresh_s), self._first[:-1])
-
-    @property
-    def how(self) -> Held:
-        """Rules of the volumes for the kernels that take ``ahead``."""
-        return self.person.predictor.how
 
     @cached_property
     def full(self) -> SweptVolumes:
@@ -240,7 +233,7 @@ class Forecast:
     def _alone(self, ahead: PeopleAhead, tick: int, horizon_s: float) -> Obstacles:
         """Obstacles of a tick alone, in one kernel: in half the time, and the same numbers."""
         rows, until_s = self.rows(tick), (horizon_s, horizon_s + ahead.latency_s)
-        hulls = hulls_of(self.how, ahead.rows, rows.start, rows.stop, until_s, True)
+        hulls = hulls_of(self.person.held, rows.start, rows.stop, until_s, True)
         found = Obstacles(hulls.vertices, hulls.offsets, hulls.radius, hulls.boxes, hulls.known, horizon_s)
         return self.around.numbered(found, ahead.number[rows].tolist())
 

@@ -12,7 +12,6 @@ import pytest
 
 from hrcreplay.commands import replay
 from hrcreplay.human.model import skeleton
-from hrcreplay.human.prediction.sound_volumes import SoundRows
 from hrcreplay.kernels import Held
 from hrcreplay.logs.reader import open_log
 from hrcreplay.pipeline import assembly, stages, surroundings
@@ -70,9 +69,9 @@ def test_a_tick_alone_is_computed_in_one_kernel_and_has_the_same_numbers(monkeyp
     alone: list[int] = []
     compute = hulls_of
 
-    def listening(how: Held, rows: SoundRows, first: int, *given: Any) -> TickHulls:
+    def listening(person: Held, first: int, *given: Any) -> TickHulls:
         alone.append(first)
-        return compute(how, rows, first, *given)
+        return compute(person, first, *given)
 
     monkeypatch.setattr(surroundings, "hulls_of", listening)
     late = replace(STAGE, settings=STAGE.settings.model_copy(update={"latency_s": 0.05}))

@@ -145,7 +145,7 @@ class SoundRows(NamedTuple):
     speed: Floats  #: (n, 7) of the limbs of BODY [m/s]
 
 
-def sound_rows(states: HumanStates, prediction: Prediction, rules: SoundRules, how: Held) -> SoundRows:
+def sound_rows(states: HumanStates, prediction: Prediction, rules: SoundRules, how: Held) -> tuple[SoundRows, Held]:
     """Computes what the volumes of all horizons have in common.
 
     Args:
@@ -153,6 +153,9 @@ def sound_rows(states: HumanStates, prediction: Prediction, rules: SoundRules, h
         prediction: Margins added to the model.
         rules: From ``sound_rules``, for the same settings.
         how: The rules, and a surface to work with, for the kernel.
+
+    Returns:
+        It, and what ``sweep_sound`` takes.
     """
     velocity, speed = motion_of_limbs(states)
     rows = SoundRows(
@@ -164,8 +167,7 @@ def sound_rows(states: HumanStates, prediction: Prediction, rules: SoundRules, h
         velocity=velocity,
         speed=speed,
     )
-    _radii_rows(rows, np.ascontiguousarray(states.residual_m), how)
-    return rows
+    return rows, _radii_rows(rows, np.ascontiguousarray(states.residual_m), how)
 
 
 #: Points of each of LIMBS that may have an offset from the model.
@@ -179,7 +181,7 @@ _POINTS = np.array(
 
 
 @njit(cache=True)
-def _radii_rows(rows: SoundRows, residual: Floats, how: Held) -> None:
+def _radii_rows(rows: SoundRows, residual: Floats, how: Held) -> Held:
     """Writes the radii of volumes from the joints: those of the limbs plus the errors of the model.
 
     These errors are the displacement by an error of a length up the chain, the residual, and the offset of the points
@@ -187,8 +189,11 @@ def _radii_rows(rows: SoundRows, residual: Floats, how: Held) -> None:
     uses the thorax's. The residual of the legs is the distance of their middles from the line below the pelvis; if its
     sum with a thigh's radius is larger, that sum is the radius. It is never reduced for legs last seen close to the
     line, as a table may hide a later change.
+
+    Returns:
+        What ``sweep_sound`` takes.
     """
-    rules, _ = how.value
+    rules, work = how.value
     unknown, points, found = rules.unknown_m, rows.tubed.points, rows.radii
     modelled = np.full(points.shape[1:], np.nan)
     for i in range(len(found)):
@@ -202,6 +207,7 @@ def _radii_rows(rows: SoundRows, residual: Floats, how: Held) -> None:
             found[i, limb] = base if np.isnan(unknown) else base + further
         if len(found[i]) > LEGS and not np.isnan(unknown):  # at least their observed distance
             found[i, LEGS] = np.fmax(found[i, LEGS], residual[i, LEGS] + (THIGH_M + ROUNDING_M))
+    return Held((rules, work, rows))
 
 
 @njit(cache=True, inner=True)
@@ -215,12 +221,11 @@ def _beside_m(limb: int, points: Floats, modelled: Floats) -> float:
 
 
 @njit(cache=True)
-def sweep_sound(how: Held, rows: SoundRows, first: int, last: int, span_s: Floats) -> tuple[Floats, Ints, Floats]:
+def sweep_sound(person: Held, first: int, last: int, span_s: Floats) -> tuple[Floats, Ints, Floats]:
     """Computes the swept volumes of all limbs for the rows ``first`` to ``last`` - 1.
 
     Args:
-        how: ``SoundRules``, and a surface to work with.
-        rows: The person.
+        person: ``SoundRules``, a surface to work with, and ``SoundRows``.
         first: First row.
         last: Row after the last one.
         span_s: (n,) horizon and latency of each row [s].
@@ -228,7 +233,7 @@ def sweep_sound(how: Held, rows: SoundRows, first: int, last: int, span_s: Float
     Returns:
         Vertices (m, 3) [m] and the offsets of ``SweptVolumes``, and (n, limbs) radii [m].
     """
-    rules, work = how.value
+    rules, work, rows = person.value
     limbs = rows.radii.shape[1]
     radii = rows.radii[first:last].copy()
     offsets = np.zeros((last - first) * limbs + 1, np.int64)

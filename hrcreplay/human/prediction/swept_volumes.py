@@ -274,8 +274,8 @@ class Predictor:
             SettingsError: The method is unknown.
         """
         sound = code_of(self.prediction.method) == SOUND
-        rows = sound_rows(states, self.prediction, self.rules, self.how) if sound else None
-        return PreparedPerson(self, states, rows)
+        rows, held = sound_rows(states, self.prediction, self.rules, self.how) if sound else (None, None)
+        return PreparedPerson(self, states, rows, held)
 
     @cached_property
     def limbs(self) -> tuple[str, ...]:
@@ -310,6 +310,7 @@ class PreparedPerson:
     predictor: Predictor
     states: HumanStates
     rows: SoundRows | None  #: None for the printed methods
+    held: Held | None  #: the same, with the rules, for kernels that compute volumes; None likewise
 
     def volumes(self, horizon_s: float | Floats, first: int = 0, last: int | None = None) -> SweptVolumes:
         """Computes the swept volumes of the ticks ``first`` to ``last`` - 1; see ``predict``.
@@ -355,10 +356,10 @@ class PreparedPerson:
     def _filtered(self, horizon_s: Floats, first: int, last: int) -> SweptVolumes:
         """Volumes from the filtered states; unknown for bodies that have none."""
         t_ns, prediction = self.states.t_ns[first:last], self.predictor.prediction
-        if self.rows is None:
+        if self.held is None:
             return self._printed(self.states.rows(slice(first, last)), horizon_s)
         span_s = horizon_s + prediction.latency_s
-        vertices, offsets, radii = sweep_sound(self.predictor.how, self.rows, first, last, span_s)
+        vertices, offsets, radii = sweep_sound(self.held, first, last, span_s)
         return SweptVolumes(t_ns, offsets, vertices, radii, self.predictor.limbs, prediction.method)
 
     def _printed(self, states: HumanStates, horizon_s: Floats) -> SweptVolumes:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hrcreplay.geometry.vectors import norm_n
-from hrcreplay.human.prediction.sound_volumes import SoundRows, sweep_sound
+from hrcreplay.human.prediction.sound_volumes import sweep_sound
 from hrcreplay.kernels import Held, njit
 from hrcreplay.records import Bools, Floats, Ints
 from hrcreplay.robot.control.control_step import Taken, horizon_after
@@ -27,9 +27,8 @@ KNOWN, TOO_OLD, LEFT = range(3)
 
 
 class PeopleAhead(NamedTuple):
-    """The people of a batch of ticks, prepared for volumes at any horizon."""
+    """Who is there at the ticks of a batch."""
 
-    rows: SoundRows
     first: Ints  #: (n + 1,) first row of each tick
     number: Ints  #: number of each row's person
     what: Ints  #: (n,) KNOWN, TOO_OLD or LEFT
@@ -86,7 +85,7 @@ def empty_columns(ticks: int, axes: int) -> MotionColumns:
 def run_ticks(
     scene: Held,
     way: Way,
-    how: Held,
+    person: Held,
     people: PeopleAhead,
     moving: Moving,
     found: MotionColumns,
@@ -97,8 +96,8 @@ def run_ticks(
     Args:
         scene: Arm, programmed path, rules and objects.
         way: The method.
-        how: ``SoundRules``, and a surface to work with.
-        people: The people of the batch.
+        person: The people of the batch, for ``sweep_sound``.
+        people: Who is there at each tick.
         moving: Robot and reference at the first tick; a robot along its path is on it.
         found: Receives the rows.
         tick: First tick.
@@ -111,7 +110,7 @@ def run_ticks(
         start = moving.start
         horizon_s = horizon_after(len(start.stop.q) - 1, rules.ahead)
         rows, known = (people.first[tick], people.first[tick + 1]), people.what[tick] == KNOWN
-        hulls = hulls_of(how, people.rows, *rows, (horizon_s, horizon_s + people.latency_s), known)
+        hulls = hulls_of(person, *rows, (horizon_s, horizon_s + people.latency_s), known)
         if way.by_qp:
             seen = decide_at_once(arm, grid, rules, static, start, hulls)
             if not seen.decided:
@@ -127,7 +126,7 @@ def run_ticks(
             s_s = taken.stop.along[0, 0]
             point = sample(grid, arm.chain, s_s)
         _write(found, tick, moving, pose, nearest, taken, horizon_s, rules.qp.dt_s)
-        found.limb[tick] = _index(people, tick, nearest)
+        found.limb[tick] = _index(people, tick, nearest, len(hulls.radius))
         start = TickStart(taken.stop, found.u[tick].copy(), s_s, point.T_world_tcp, planes)
         moving = Moving(start, point)
         tick += 1
@@ -135,12 +134,11 @@ def run_ticks(
 
 
 @njit(cache=True)
-def hulls_of(how: Held, rows: SoundRows, first: int, last: int, until_s: tuple[float, float], known: bool) -> TickHulls:
+def hulls_of(person: Held, first: int, last: int, until_s: tuple[float, float], known: bool) -> TickHulls:
     """The volumes of a tick that is not left to Python, as far as they are known.
 
     Args:
-        how: ``SoundRules``, and a surface to work with.
-        rows: The people of the batch.
+        person: The people of the batch, for ``sweep_sound``.
         first: First row of the tick.
         last: Past its last row.
         until_s: Time from the tick on for which the volumes are valid, and that with the latency [s].
@@ -148,18 +146,18 @@ def hulls_of(how: Held, rows: SoundRows, first: int, last: int, until_s: tuple[f
     """
     if not known:  # the robot stands, and no volume is looked at
         return TickHulls(np.empty((0, 3)), np.zeros(1, np.int64), np.empty(0), np.empty((0, 2, 3)), False, until_s[0])
-    vertices, offsets, radii = sweep_sound(how, rows, first, last, np.full(last - first, until_s[1]))
+    vertices, offsets, radii = sweep_sound(person, first, last, np.full(last - first, until_s[1]))
     radius = radii.reshape(-1)
     around, whole = boxes(vertices, offsets, radius)
     return TickHulls(vertices, offsets, radius, around, whole, until_s[0])
 
 
 @njit(cache=True, inner=True)
-def _index(people: PeopleAhead, tick: int, nearest: NearestLink) -> int:
-    """Index of the nearest volume among all possible ones, as ``Surroundings.names_of`` orders them; -1 without one."""
+def _index(people: PeopleAhead, tick: int, nearest: NearestLink, count: int) -> int:
+    """Index of the nearest of ``count`` volumes among all possible ones, as ``names_of`` has them; -1 without one."""
     if math.isnan(nearest.surface_m):
         return -1
-    each = people.rows.radii.shape[1]
+    each = count // (people.first[tick + 1] - people.first[tick])
     number = people.number[people.first[tick] + nearest.limb // each]
     return int((number - 1) * each + nearest.limb % each)
 
