@@ -100,7 +100,7 @@ class Foreseen:
     oracle: Oracle
     predicted: PreparedPerson
     states: HumanStates
-    rows: None = None  #: no kernel can predict these volumes, so none decides whole ticks
+    held: None = None  #: no kernel can predict these volumes, so none decides whole ticks
 
     def volumes(self, horizon_s: float, first: int = 0, last: int | None = None) -> SweptVolumes:
         """The recorded limbs of the ticks ``first`` to ``last`` - 1 until ``horizon_s`` after them [s]."""
