@@ -243,6 +243,13 @@ def test_hulls_that_are_stored_a_few_at_a_time_give_the_same_block(
     assert largest == pytest.approx(np.abs(far.volumes.vertices_m).max(), rel=1e-4)
 
 
+def test_a_run_without_a_recorded_body_has_a_block_too() -> None:
+    run = moving_run(3.0)
+    header = json.loads(replay_data(moving_scene(dataclasses.replace(run, body=None, contact=None)))[0])
+    assert (header["entries"]["body"]["rows"], header["entries"]["body"]["columns"]) == (header["count"], 0)
+    assert header["entries"]["points"]["columns"] == 3 * len(SHOWN_POINTS)
+
+
 def test_the_same_run_gives_the_same_block() -> None:
     first, second = (replay_data(moving_scene(moving_run(3.0))) for _ in range(2))
     assert first == second

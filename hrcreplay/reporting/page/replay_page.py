@@ -164,7 +164,10 @@ class NumberBlock:
         """
         table = np.asarray(values).reshape(len(values), math.prod(values.shape[1:]))
         unit = max(unit, _largest(table) / _LARGEST)
-        self.add_counts(name, np.column_stack([_counts(column, unit) for column in table.T]), unit)
+        counts = np.empty(table.shape, np.int16)
+        for k, column in enumerate(table.T):
+            counts[:, k] = _counts(column, unit)
+        self.add_counts(name, counts, unit)
 
     def add_counts(self, name: str, counts: NDArray[np.int16], unit: float) -> None:
         """Adds counts (n, k) of steps, or ``MISSING``; ``unit`` is the step of one count."""
