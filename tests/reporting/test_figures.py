@@ -208,6 +208,18 @@ def test_the_largest_deviation_is_where_the_tcp_was_furthest_from_every_point_of
         assert deviation_m(run.motion).max() == found.length_m
 
 
+def test_the_figure_of_the_path_shows_all_of_both_ways() -> None:
+    run = make_run(6.0)
+    assert run.motion is not None
+    far = frame_of(run.motion)
+    far["tcp_y"], far["ref_x"] = far["tcp_y"] + 0.7, far["ref_x"] - 0.9
+    above = planning.path(far, None, T0_NS).axes[0]
+    for (low, high), axis in ((above.get_xlim(), "x"), (above.get_ylim(), "y")):
+        for what in ("ref", "tcp"):
+            assert low < far[f"{what}_{axis}"].min()
+            assert far[f"{what}_{axis}"].max() < high
+
+
 def test_instants_are_a_second_apart_and_hold_the_nearest() -> None:
     run = make_run(12.0)
     assert run.motion is not None

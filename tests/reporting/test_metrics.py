@@ -12,7 +12,7 @@ import pytest
 from hrcreplay.records import JOINTS, Floats
 from hrcreplay.reporting.metrics import series
 from hrcreplay.reporting.metrics.fusion import frames_of
-from hrcreplay.reporting.metrics.planning import add_plan, cycles, waited_s
+from hrcreplay.reporting.metrics.planning import add_plan, cycles, tracking_error_m, waited_s
 from hrcreplay.reporting.metrics.series import MetricTable, feet_in_turn
 from hrcreplay.store.run_folder import Run
 from tests.reporting.synthetic import T0_NS, frame_of, make_run, metrics_of
@@ -311,6 +311,15 @@ def test_distance_from_a_path_that_was_driven_many_times() -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(series, "_TOGETHER", 11)
         np.testing.assert_array_equal(path_feet(points, path), together)
+
+
+def test_the_tracking_error_is_the_distance_from_the_reference() -> None:
+    rng = np.random.default_rng(8)
+    tcp, ref = rng.normal(size=(2, 50, 3))
+    motion = pd.DataFrame(
+        {f"{what}_{axis}": at[:, k] for what, at in (("tcp", tcp), ("ref", ref)) for k, axis in enumerate("xyz")}
+    )
+    np.testing.assert_allclose(tracking_error_m(motion), [math.dist(a, b) for a, b in zip(tcp, ref, strict=True)])
 
 
 def test_a_reference_waits_where_its_time_stands() -> None:
