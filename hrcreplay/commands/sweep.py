@@ -44,6 +44,8 @@ from hrcreplay.version import __version__
 COMMANDS = ("report", "plan")
 _ANSWER_S = 15  # time for a scheduler to answer
 _LONGEST = 120  # characters of the name of a folder
+#: Settings of a cluster on this computer: nobody looks at what Dask measures beside the runs, and it takes their time.
+_UNWATCHED = {"distributed.worker.profile.enabled": False, "distributed.admin.tick.interval": "1s"}
 
 
 @dataclass(frozen=True)
@@ -344,6 +346,7 @@ def _cluster(scheduler: str | None, workers: int | None) -> Iterator[Any]:
         SettingsError: dask.distributed is not installed, or nothing answers at the address.
     """
     try:
+        import dask
         from distributed import Client, LocalCluster
     except ImportError as error:
         raise SettingsError(
@@ -364,7 +367,7 @@ def _cluster(scheduler: str | None, workers: int | None) -> Iterator[Any]:
         return
     count = workers or os.cpu_count() or 1
     how = {"threads_per_worker": 1, "dashboard_address": None, "silence_logs": logging.CRITICAL}
-    with LocalCluster(n_workers=count, **how) as cluster, Client(cluster) as client:
+    with dask.config.set(_UNWATCHED), LocalCluster(n_workers=count, **how) as cluster, Client(cluster) as client:
         yield client
 
 

@@ -23,6 +23,8 @@ _STEPS = np.array([1.0 / _G, 1.0 / _G**2, 1.0 / _G**3])
 _PARTS = 4
 #: Number of sample points in the box of the part below a height: their error is 0.2 % of that box.
 _BELOW = 2048
+#: Number of points whose triangles are found at once.
+_BLOCK = 256
 
 
 @dataclass(frozen=True)
@@ -130,23 +132,51 @@ def _mark(points: Floats, vertices: Floats, faces: Ints, radius: float, inside: 
     for vertex in vertices:
         for k in range(3):
             low[k], high[k] = min(low[k], vertex[k]), max(high[k], vertex[k])
+    some, which, count = np.empty((3, _BLOCK)), np.empty(_BLOCK, np.int64), 0
+    highest, facing = np.empty(_BLOCK), np.empty(_BLOCK, np.int64)
     for i in range(len(points)):
-        outside, point = inside[i], _corner(points, i)
+        outside = inside[i]
         for k in range(3):
-            outside = outside or point[k] < low[k] - radius or point[k] > high[k] + radius
-        f, facing, highest = 0, 0, -np.inf
-        while not outside and f < len(faces):
-            height = dot((normals[f, 0], normals[f, 1], normals[f, 2]), point) - offsets[f]
-            if height > highest:
-                facing, highest = f, height
-            outside = highest > radius
-            f += 1
-        if not outside and len(faces):  # mostly the nearest triangle is the one that faces the point most
-            apart2 = _triangle(point, vertices, faces, normals, facing, highest)
-            inside[i] = outside = highest < -behind or apart2 <= radius * radius
-            outside = outside or _is_beyond(point, vertices, faces[facing], radius)
-        if not outside:
-            inside[i] = _distance(point, vertices, faces, normals, offsets, behind, radius) <= radius
+            outside = outside or points[i, k] < low[k] - radius or points[i, k] > high[k] + radius
+            some[k, count] = points[i, k]
+        which[count] = i
+        count += not outside
+        if count < _BLOCK and i + 1 < len(points):
+            continue
+        _find_facing(some, normals, offsets, highest, facing)
+        for j in range(count):
+            if highest[j] > radius:
+                continue
+            point, f, near = (some[0, j], some[1, j], some[2, j]), facing[j], False
+            if len(faces):  # mostly the nearest triangle is the one that faces the point most
+                near = highest[j] < -behind
+                near = near or _triangle(point, vertices, faces, normals, f, highest[j]) <= radius * radius
+                if not near and _is_beyond(point, vertices, faces[f], radius):
+                    continue
+            inside[which[j]] = near or _distance(point, vertices, faces, normals, offsets, behind, radius) <= radius
+        count = 0
+
+
+@njit(cache=True, inner=True)
+def _find_facing(points: Floats, normals: Floats, offsets: Floats, highest: Floats, facing: Ints) -> None:
+    """The triangle that faces each point most.
+
+    Args:
+        points: (3, k) [m].
+        normals: (f, 3) of the triangles.
+        offsets: (f,) of their planes [m].
+        highest: (k,) receives the largest height above a plane [m].
+        facing: (k,) receives that triangle.
+    """
+    x, y, z = points[0], points[1], points[2]
+    highest[:], facing[:] = -np.inf, 0
+    for f in range(len(normals)):
+        u, v, w, offset = normals[f, 0], normals[f, 1], normals[f, 2], offsets[f]
+        for i in range(len(x)):  # written so that several points are taken at once
+            height = u * x[i] + v * y[i] + w * z[i] - offset
+            higher = height > highest[i]
+            highest[i] = height if higher else highest[i]
+            facing[i] = f if higher else facing[i]
 
 
 @njit(cache=True, inner=True)

@@ -33,6 +33,8 @@ Columns = dict[str, Any]
 #: Name of the joint ``z`` among the lengths of the paper; the tables contain both names.
 _HEIGHT, _AS_LENGTH = JOINTS.index("z"), "pi_pelvis_height"
 _LENGTHS = (_AS_LENGTH, *LENGTHS)
+#: Rows of state.parquet that are read together: of fewer, each column takes longer to find than to read.
+_ROWS = 4096
 
 
 def with_person(columns: Columns, person: Ints | None) -> Columns:
@@ -137,21 +139,30 @@ def read_states(path: Path, chunk_ticks: int) -> Iterator[HumanStates]:
     pending: HumanStates | None = None
     with pq.ParquetFile(path, pre_buffer=False) as file:  # the buffer would hold the whole file until the end
         cameras = _cameras(file)
-        for batch in file.iter_batches(batch_size=chunk_ticks):
+        for batch in file.iter_batches(batch_size=max(chunk_ticks, _ROWS), use_threads=False):
             states = _states(
                 {name: batch.column(name).to_numpy(zero_copy_only=False) for name in batch.schema.names}, cameras
             )
             if states.person is None:
-                yield states
+                yield from _pieces(states, chunk_ticks)
                 continue
-            if pending is not None:  # its last tick may go on in this chunk
+            if pending is not None:  # its last tick may go on in this batch
                 whole = int(np.searchsorted(pending.t_ns, pending.t_ns[-1]))
-                if whole:
-                    yield pending.rows(slice(0, whole))
+                yield from _pieces(pending.rows(slice(0, whole)), chunk_ticks)
                 states = HumanStates.join([pending.rows(slice(whole, None)), states])
             pending = states
     if pending is not None:
-        yield pending
+        yield from _pieces(pending, chunk_ticks)
+
+
+def _pieces(states: HumanStates, size: int) -> Iterator[HumanStates]:
+    """Divides a table into pieces of ``size`` rows, and the rest of a tick that began there."""
+    first = 0
+    while first < len(states.t_ns):
+        last_ns = states.t_ns[min(first + size, len(states.t_ns)) - 1]
+        end = int(np.searchsorted(states.t_ns, last_ns, side="right"))
+        yield states.rows(slice(first, end))
+        first = end
 
 
 def read_states_at(path: Path, at_ns: Ints) -> HumanStates:
