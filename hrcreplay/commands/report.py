@@ -67,12 +67,12 @@ def write_report(
         meta: Content of run.json.
         log: Log of a replay, whose ticks can be computed again; None for a live session.
         progress: Receives the progress.
-        second: A second process, which writes scene.mcap and draws some figures; None: no such process.
+        second: A second process, which makes the replay and draws some figures; None: no such process.
     """
     progress.begin("metrics")
     near = _bounds(run_config.settings.model_dump())
     meta["cameras"] = {name: T.tolist() for name, T in sorted(_camera_poses(run_config, log).items())}
-    there = None if second is None else (second, second.submit(_write_scene, run_config, writer.partial, meta))
+    there = None if second is None else (second, second.submit(_replay_there, run_config, writer.partial, meta))
     everybody = run_folder.read(writer.partial, meta)
     found = compute(everybody, **near)
     release_freed_memory()
@@ -88,11 +88,11 @@ def write_report(
         radii["legs, of sound"] = prediction.legs_radius_m
     folder = writer.partial / "figures"
     kinds = catalogue.select_figures(run, found)
-    here = None if there is not None else writer.partial / "scene.mcap"
-    replay = _make_replay(run_config, everybody, here)
-    release_freed_memory()
+    replay = None if there is not None else _make_replay(run_config, everybody)
     people = most_tracked(everybody, _DRAWN)
     _draw_figures(run_config, everybody, found, kinds, folder, people=people, progress=progress, second=there)
+    if there is not None:
+        replay = there[1].result()
     progress.begin("page")
     shown = [
         tables.limit_table(run_config.prediction_limits, use="prediction"),
@@ -103,28 +103,26 @@ def write_report(
         "report.html",
         report_page.render(run, found, folder, shown, stops=stops, replay=replay, people=people),
     )
-    if there is not None:
-        there[1].result()
     if replay is not None:
         writer.text("foxglove-layout.json", foxglove_layout())
 
 
-def _make_replay(run_config: RunConfig, run: Run, path: Path | None) -> ReplayPart | None:
-    """Makes the replay of the page, and writes the scene to a path, if one is given; None for a run without a robot."""
+def _make_replay(run_config: RunConfig, run: Run) -> ReplayPart | None:
+    """Writes scene.mcap and makes the replay of the page; None for a run without a robot."""
     scene = scene_of(run_config, run)
-    if scene is not None and path is not None:
-        write_scene(path, scene, run.measurements)
     release_freed_memory()
-    return None if scene is None else replay_part(scene)
+    if scene is None:
+        return None
+    write_scene(run.folder / "scene.mcap", scene, run.measurements)
+    release_freed_memory()
+    return replay_part(scene)
 
 
-def _write_scene(run_config: RunConfig, folder: Path, meta: dict[str, Any]) -> None:
-    """Writes scene.mcap in the second process."""
-    everybody = _tables(folder, json.dumps(meta))
-    scene = scene_of(run_config, everybody)
+def _replay_there(run_config: RunConfig, folder: Path, meta: dict[str, Any]) -> ReplayPart | None:
+    """Does it in the second process."""
+    made = _make_replay(run_config, _tables(folder, json.dumps(meta)))
     release_freed_memory()
-    if scene is not None:
-        write_scene(folder / "scene.mcap", scene, everybody.measurements)
+    return made
 
 
 @lru_cache(maxsize=1)

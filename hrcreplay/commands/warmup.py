@@ -17,7 +17,7 @@ import numpy as np
 
 from hrcreplay.calibration.registration import find_clock_offset
 from hrcreplay.commands import replay
-from hrcreplay.geometry.convex_hull import visible_front
+from hrcreplay.geometry.convex_hull import above, visible_front
 from hrcreplay.geometry.distances import farthest_at_most
 from hrcreplay.geometry.inflated_hull import InflatedHull
 from hrcreplay.geometry.polyline import advance_foot, follow_nearer, nearest_vertices
@@ -88,6 +88,7 @@ def _compile_rest(states: HumanStates) -> None:
     hull = InflatedHull.around(np.vstack([np.zeros(3), np.eye(3)]), 0.1)
     hull.distances_m(np.ones((2, 3)))
     farthest_at_most(np.ones((2, 3)), hull.vertices_m, 0.1)
+    above(hull.vertices_m, hull.faces, 0.1)
     turn, pixels_m = np.eye(3)[:, :2].copy(), np.linspace(-1.0, 1.0, 4)
     for corners_m in (np.asfortranarray(hull.vertices_m), np.ones((4, 6))[:, ::2]):  # of tables
         multiply(corners_m, turn)

@@ -108,8 +108,9 @@ class BodyTrack:
     def axes_m(self, at_ns: Ints, hand_m: float) -> Floats:
         """(m, 14, 2, 3) axes of the capsules of ``PARTS`` at some instants; with one known end, a ball [m]."""
         axes = part_axes(at_instants(self.t_ns, self.points_m, at_ns, GAP_S, self.hold_s), hand_m)
-        known: Bools = np.asarray(np.isfinite(axes).all(axis=3, keepdims=True))
-        return np.where(known, axes, axes[:, :, ::-1])
+        known: Bools = np.isfinite(axes)
+        known = known[..., 0] & known[..., 1] & known[..., 2]  # sooner than along so short an axis
+        return np.where(known[..., None], axes, axes[:, :, ::-1])
 
     def is_near(self, first_ns: int, last_ns: int) -> bool:
         """Returns True if the track has a sample near enough to a time span to count in it."""

@@ -83,24 +83,56 @@ def _flat(points_m: Floats, axes: Floats) -> tuple[Floats, Ints]:
     return points_m[corners], np.concatenate([_fan(loop), _fan(np.roll(loop, -1))[:, ::-1]])
 
 
+@njit(cache=True)
 def above(points_m: Floats, triangles: Ints, height_m: float) -> tuple[Floats, Ints]:
-    """Returns the part of a convex polytope above a height, in the form of ``hull``; no corners if all of it is below.
+    """Cuts off the part of a convex polytope below a height; no corners if all of it is below.
 
     Args:
         points_m: (n, 3) points, its corners among them [m].
-        triangles: (f, 3) of its surface, in any order.
-        height_m: The part below this height is removed [m].
+        triangles: (f, 3) of its surface, counterclockwise seen from outside.
+        height_m: Height [m].
+
+    Returns:
+        Corners (k, 3) [m] and triangles (g, 3) of the closed surface of the rest, as ``hull`` has them.
     """
-    ends = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2))
-    a, b = points_m[np.array(np.divmod(np.unique(ends[:, 0] * len(points_m) + ends[:, 1]), len(points_m)))]
-    low, high = a[:, 2:] - height_m, b[:, 2:] - height_m
-    passes = (low * high < 0.0)[:, 0]
-    low, high = low[passes], high[passes]
-    there = (high * a[passes] - low * b[passes]) / (high - low)
-    there[:, 2] = height_m
-    corners = points_m[np.unique(triangles)]
-    kept = np.concatenate([corners[corners[:, 2] >= height_m], there])
-    return hull(kept) if len(kept) else (kept, np.empty((0, 3), np.int64))
+    high, count, faces = points_m[:, 2] - height_m, 0, 0
+    corners, cut = np.empty((len(points_m) + 3 * len(triangles), 3)), np.empty((2 * len(triangles), 3), np.int64)
+    places = np.full((len(points_m), len(points_m)), -1, np.int32)  # of a corner, or of the cut of an edge
+    for i in np.sort(triangles.ravel()):
+        if high[i] >= 0.0 and places[i, i] < 0:
+            corners[count], places[i, i] = points_m[i], count
+            count += 1
+    around = np.empty(4, np.int64)  # corners of what is left of a triangle
+    for triangle in triangles:
+        size = 0
+        for k in range(3):
+            i, j = triangle[k], triangle[(k + 1) % 3]
+            if high[i] >= 0.0:
+                around[size], size = places[i, i], size + 1
+            if high[i] * high[j] < 0.0:
+                i, j = min(i, j), max(i, j)
+                if places[i, j] < 0:
+                    corners[count] = (high[j] * points_m[i] - high[i] * points_m[j]) / (high[j] - high[i])
+                    corners[count, 2], places[i, j] = height_m, count
+                    count += 1
+                around[size], size = places[i, j], size + 1
+        for k in range(1, size - 1):
+            cut[faces, 0], cut[faces, 1], cut[faces, 2] = around[0], around[k], around[k + 1]
+            faces += 1
+    below = _lid(corners[:count], height_m) if high.min() < 0.0 else np.empty((0, 3), np.int64)
+    return corners[:count].copy(), np.concatenate((cut[:faces], below))
+
+
+@njit(cache=True, inner=True)
+def _lid(corners: Floats, height: float) -> Ints:
+    """Triangles between the corners at a height, which form a convex polygon; seen from below."""
+    loop = np.flatnonzero(corners[:, 2] == height)
+    x, y = corners[loop, 0], corners[loop, 1]
+    loop = loop[np.argsort(np.arctan2(y - y.mean(), x - x.mean()))]
+    found = np.empty((max(len(loop) - 2, 0), 3), np.int64)
+    for k in range(len(found)):
+        found[k, 0], found[k, 1], found[k, 2] = loop[0], loop[k + 2], loop[k + 1]
+    return found
 
 
 @njit(cache=True)

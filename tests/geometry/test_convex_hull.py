@@ -202,5 +202,9 @@ def test_a_hull_above_a_height_holds_the_points_that_do_both() -> None:
         assert wanted.any()
         outward = np.cross(corners[faces[:, 1]] - corners[faces[:, 0]], corners[faces[:, 2]] - corners[faces[:, 0]])
         assert ((corners[faces[:, 0]] - corners.mean(axis=0)) * outward).sum(axis=1).min() > 0.0
+        ways = [(int(face[k]), int(face[(k + 1) % 3])) for face in faces for k in range(3)]
+        assert len(set(ways)) == len(ways)
+        assert {(j, i) for i, j in ways} == set(ways), "closed"
+        assert sphere_swept_volume_m3(corners, 0.0, faces) == pytest.approx(part.volume, rel=1e-12)
     corners, faces = above(vertices, triangles, 9.0)
     assert corners.shape == faces.shape == (0, 3)

@@ -63,7 +63,7 @@ def test_two_processes_write_the_same_bytes_as_one(tmp_path: Path, monkeypatch: 
     assert {"contact.parquet", "severity.parquet", "motion_none.parquet", "motion_scaling.parquet"} <= set(found[0])
     assert set(taken) == {"_start", "_take", "_finish", "_take_there", "_coverages_there", "_judge_there"} | {
         "_forget_there",
-        "_write_scene",
+        "_replay_there",
         "draw_there",
     }
 
