@@ -63,7 +63,8 @@ def fill_optional(table: pa.Table, names: Sequence[str]) -> pa.Table:
 class TableWriter:
     """A parquet file written chunk by chunk, in row groups of a fixed size for any chunk size.
 
-    If an optional column comes only with later rows, the earlier ones are written again with it.
+    Arrays that were given must not change: they are converted when a group is full. If an optional column comes only
+    with later rows, the earlier ones are written again with it.
     """
 
     ROWS = 8192
@@ -71,49 +72,74 @@ class TableWriter:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._writer: pq.ParquetWriter | None = None
-        self._waiting: list[pa.Table] = []
+        self._names: tuple[str, ...] = ()  #: of the columns of the file
+        self._waiting: list[Mapping[str, Any]] = []
+        self._count = 0  #: number of waiting rows
 
     def write(self, columns: Mapping[str, Any]) -> None:
         """Appends rows given as columns: numpy arrays or arrow arrays."""
-        table = arrow_table(columns)
-        if self._waiting:
-            table = fill_optional(table, self._waiting[0].column_names)
-            if table.num_columns > self._waiting[0].num_columns:
-                self._widen(table.column_names)
-        self._waiting.append(table)
-        if sum(len(table) for table in self._waiting) >= self.ROWS:
-            table = pa.concat_tables(self._waiting).combine_chunks()
-            whole = len(table) // self.ROWS * self.ROWS
+        self._waiting.append(columns)
+        self._count += _rows(columns)
+        if self._count >= self.ROWS:
+            joined, whole = self._join(), self._count // self.ROWS * self.ROWS
             for first in range(0, whole, self.ROWS):
-                self._flush(table.slice(first, self.ROWS))
-            self._waiting = [table.slice(whole)]
+                self._flush({name: column[first : first + self.ROWS] for name, column in joined.items()})
+            self._waiting = [{name: column[whole:] for name, column in joined.items()}]
+            self._count -= whole
+
+    def _join(self) -> dict[str, Any]:
+        """The waiting rows, with all columns that they or the file have."""
+        names = max((self._names, *map(tuple, self._waiting)), key=len)
+        if self._writer is not None and len(names) > len(self._names):
+            self._widen(names)
+        filled = [
+            {name: np.full(_rows(part), OPTIONAL[name]) for name in names if name in OPTIONAL} | dict(part)
+            for part in self._waiting
+        ]
+        return {name: _joined([part[name] for part in filled]) for name in names}
 
     def _widen(self, names: Sequence[str]) -> None:
         """Writes all rows so far again, with the optional columns among ``names``, one group of rows at a time."""
-        self._waiting = [fill_optional(table, names) for table in self._waiting]
-        if self._writer is None:
-            return
-        self._writer.close()
+        if self._writer is not None:
+            self._writer.close()
         self._writer, narrow = None, self._path.with_suffix(".narrow")
         self._path.rename(narrow)
         with pq.ParquetFile(narrow) as before:
             for group in range(before.num_row_groups):
-                self._flush(fill_optional(before.read_row_group(group), names))
+                table = fill_optional(before.read_row_group(group), names)
+                self._flush(dict(zip(table.column_names, table.columns, strict=True)))
         narrow.unlink()
 
-    def _flush(self, table: pa.Table) -> None:
+    def _flush(self, columns: Mapping[str, Any]) -> None:
+        table = arrow_table(columns)
         if self._writer is None:
             names = [field.name for field in table.schema if pa.types.is_string(field.type)]  # numbers hardly repeat
             self._writer = pq.ParquetWriter(self._path, table.schema, compression="lz4", use_dictionary=names)
+            self._names = tuple(table.column_names)
         self._writer.write_table(table.combine_chunks())
 
     def close(self) -> None:
         """Writes the remaining rows. A table without rows has no file."""
-        rest = [table for table in self._waiting if len(table)]
-        if rest or (self._waiting and self._writer is None):
-            self._flush(pa.concat_tables(rest or self._waiting[:1]))
+        if self._count or (self._waiting and self._writer is None):
+            self._flush(self._join())
         if self._writer is not None:
             self._writer.close()
+
+
+def _rows(columns: Mapping[str, Any]) -> int:
+    """Number of rows."""
+    return len(next(iter(columns.values())))
+
+
+def _joined(parts: Sequence[Any]) -> Any:
+    """One column of several parts, of numpy or of arrow."""
+    if all(isinstance(part, np.ndarray) for part in parts):
+        return np.concatenate(parts)
+    return pa.chunked_array([chunk for part in parts for chunk in _chunks(part)])
+
+
+def _chunks(column: Any) -> list[pa.Array]:
+    return column.chunks if isinstance(column, pa.ChunkedArray) else [pa.array(column)]
 
 
 def arrow_table(columns: Mapping[str, Any]) -> pa.Table:
