@@ -67,7 +67,7 @@ def write_report(
         meta: Content of run.json.
         log: Log of a replay, whose ticks can be computed again; None for a live session.
         progress: Receives the progress.
-        second: A second process, which makes the replay and draws some figures; None: no such process.
+        second: A second process, which makes the replay and draws some figures, and then ends; None: no such process.
     """
     progress.begin("metrics")
     near = _bounds(run_config.settings.model_dump())
@@ -93,6 +93,7 @@ def write_report(
     _draw_figures(run_config, everybody, found, kinds, folder, people=people, progress=progress, second=there)
     if there is not None:
         replay = there[1].result()
+        there[0].shutdown(wait=False)  # it ends while the page is made
     progress.begin("page")
     shown = [
         tables.limit_table(run_config.prediction_limits, use="prediction"),

@@ -31,7 +31,8 @@ def second_process() -> Iterator[ProcessPoolExecutor]:
             for process in set(multiprocessing.active_children()) - others:  # it would continue to the end of its work
                 process.terminate()
             # Python before 3.11.6 waits for ever for a large message that nobody reads any more.
-            pool._call_queue._reader.close()  # type: ignore[attr-defined]  # noqa: SLF001 (as later versions do)
+            if (queue := pool._call_queue) is not None:  # type: ignore[attr-defined]  # noqa: SLF001 (None: it ends)
+                queue._reader.close()  # noqa: SLF001 (as later versions do)
             pool.shutdown(cancel_futures=True)
             raise
 

@@ -34,6 +34,10 @@ def test_two_processes_write_the_same_bytes_as_one(tmp_path: Path, monkeypatch: 
             taken.append(work.__name__)
             return self.pool.submit(work, *given, **named)
 
+        def shutdown(self, *, wait: bool) -> None:
+            taken.append("shutdown")
+            self.pool.shutdown(wait=wait)
+
     rest: Any = replay.complete
 
     def complete(*given: Any) -> None:
@@ -65,7 +69,9 @@ def test_two_processes_write_the_same_bytes_as_one(tmp_path: Path, monkeypatch: 
         "_forget_there",
         "_replay_there",
         "draw_there",
+        "shutdown",
     }
+    assert taken[-1] == "shutdown"
 
 
 def test_a_value_goes_to_the_other_process_by_a_file(tmp_path: Path) -> None:
@@ -175,3 +181,10 @@ def test_an_error_there_is_raised_here() -> None:
 def test_an_error_of_the_second_process_is_that_of_the_run() -> None:
     with pytest.raises(LookupError, match="as it does"), second_process() as pool:
         pool.submit(_fail).result()
+
+
+def test_an_error_after_the_end_of_the_second_process_is_that_of_the_run() -> None:
+    with pytest.raises(LookupError, match="as it does"), second_process() as pool:
+        pool.submit(int).result()
+        pool.shutdown(wait=False)
+        _fail()
