@@ -191,9 +191,9 @@ _Identity = tuple[Path, int, int, int]
 
 
 @lru_cache(maxsize=1)
-def _reader(identity: _Identity) -> pq.ParquetFile:
-    """Opens a file. Only the last stays open, as the descriptions of an hour's tables take 130 MB."""
-    return pq.ParquetFile(identity[0])
+def _description(identity: _Identity) -> pq.FileMetaData:
+    """Reads what a file says of its groups of rows. Only the last is kept, as those of an hour's tables take 130 MB."""
+    return pq.read_metadata(identity[0])
 
 
 class _File:
@@ -214,11 +214,14 @@ class _File:
     def __init__(self, identity: _Identity) -> None:
         self._identity = identity
         weakref.finalize(self, _LAST.forget, id(self))
-        about = _reader(identity).metadata
+        about = _description(identity)
         self.names = tuple(about.schema.to_arrow_schema().names)
         self.length = int(about.num_rows)
         counts = [about.row_group(i).num_rows for i in range(about.num_row_groups)]
         self._starts = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
+
+    def _opened(self) -> pq.ParquetFile:
+        return pq.ParquetFile(self._identity[0], metadata=_description(self._identity))
 
     def read(self, names: list[str], rows: Bools | None) -> pd.DataFrame:
         """Some columns, of all rows or of those (n,) that are True."""
@@ -242,21 +245,23 @@ class _File:
     def parts(self, names: list[str], rows: Bools | None) -> Iterator[pa.Table]:
         """Yields some columns, of all rows or of those (n,) that are True, of few groups of rows at a time."""
         groups = self._groups(rows)
-        if not groups:  # columns without rows
-            yield _reader(self._identity).schema_arrow.empty_table().select(names)
-        for k in range(0, len(groups), _GROUPS):
-            few = groups[k : k + _GROUPS]
-            table = _reader(self._identity).read_row_groups(few, columns=names, use_threads=False)
-            if rows is not None:
-                kept = np.concatenate([rows[self._starts[i] : self._starts[i + 1]] for i in few])
-                table = table.filter(pa.array(kept))
-            yield table
+        with self._opened() as file:
+            if not groups:  # columns without rows
+                yield file.schema_arrow.empty_table().select(names)
+            for k in range(0, len(groups), _GROUPS):
+                few = groups[k : k + _GROUPS]
+                table = file.read_row_groups(few, columns=names, use_threads=False)
+                if rows is not None:
+                    kept = np.concatenate([rows[self._starts[i] : self._starts[i + 1]] for i in few])
+                    table = table.filter(pa.array(kept))
+                yield table
 
     def _whole(self, name: str) -> pd.Series[Any]:
         """A whole column, kept or read."""
         found = _LAST.get(id(self), name)
         if found is None:
-            table = _reader(self._identity).read(columns=[name], use_threads=False)
+            with self._opened() as file:
+                table = file.read(columns=[name], use_threads=False)
             found = table.to_pandas(split_blocks=True, self_destruct=True)[name]
             found.to_numpy().flags.writeable = False  # whoever asks next gets the same numbers
             _LAST.keep(id(self), name, found)

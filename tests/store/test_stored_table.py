@@ -215,7 +215,7 @@ def test_tables_read_in_turn_are_each_their_own(tables: tuple[StoredTable, pd.Da
     for _ in range(2):
         same(stored[few], frame[few])
         same(reverse[few], other[few])
-    assert stored_table._reader.cache_info().currsize == 1
+    assert stored_table._description.cache_info().currsize == 1
 
 
 def test_a_table_of_some_rows_takes_a_bit_a_row(tables: tuple[StoredTable, pd.DataFrame]) -> None:
