@@ -114,9 +114,10 @@ def _make_replay(run_config: RunConfig, run: Run) -> ReplayPart | None:
     release_freed_memory()
     if scene is None:
         return None
-    write_scene(run.folder / "scene.mcap", scene, run.measurements)
+    shown = replay_part(scene)
     release_freed_memory()
-    return replay_part(scene)
+    write_scene(run.folder / "scene.mcap", scene, run.measurements)
+    return shown
 
 
 def _replay_there(run_config: RunConfig, folder: Path, meta: dict[str, Any]) -> ReplayPart | None:

@@ -28,7 +28,7 @@ from hrcreplay.robot.model import RobotModel, Segment
 from hrcreplay.settings.sections import setting
 from hrcreplay.store.memory import release_freed_memory
 from hrcreplay.store.run_folder import Run
-from hrcreplay.store.stored_table import RunTable, number_columns, text_column
+from hrcreplay.store.stored_table import RunTable, number_columns, rows_where, text_column
 
 #: Rate of the replay [Hz], and the length of a run up to which it is whole; of a longer run the rate is lower [s].
 RATE_HZ, WHOLE_S = 25.0, 600.0
@@ -429,13 +429,15 @@ def shown_skeletons(measurements: RunTable, camera: str) -> Iterator[tuple[int, 
     Raises:
         KeyError: The table has no lengths.
     """
-    mine = measurements[measurements["camera"] == camera]
+    mine = rows_where(measurements, "camera", camera)
     order = np.argsort(times(mine, "arrival_ns"), kind="stable")
-    t_ns, p, lengths_m = times(mine, "arrival_ns")[order], columns(mine), number_columns(mine, LENGTHS)
+    t_ns = times(mine, "arrival_ns")[order]
     people = times(mine, "person")[order] if "person" in mine else np.ones(len(mine), np.int64)
     for first in range(0, len(order), _TOGETHER):
         rows = order[first : first + _TOGETHER]
-        points_m, part = skeleton(p[rows], lengths_m[rows]), slice(first, first + len(rows))
+        few, back = mine.iloc[np.sort(rows)], np.argsort(np.argsort(rows))
+        points_m = skeleton(columns(few)[back], number_columns(few, LENGTHS)[back])
+        part = slice(first, first + len(rows))
         yield from zip(t_ns[part].tolist(), points_m, people[part].tolist(), strict=True)
 
 
@@ -488,7 +490,7 @@ def _track(
         slow: A TCP slower than this counts as stationary [m/s].
     """
     release_freed_memory()  # what reading the volumes, or the motion before, took
-    contact = None if run.contact is None else run.contact[run.contact["method"] == method]
+    contact = None if run.contact is None else rows_where(run.contact, "method", method)
     axes = range(1, robot.nv + 1)
     q, dq = (_pick(motion, [f"{kind}{i}" for i in axes], t_ns) for kind in ("q", "dq"))
     numbers = _pick(motion, ["tcp_speed", "ref_speed", "distance_m", "horizon_s", "tau_s", "certified"], t_ns)

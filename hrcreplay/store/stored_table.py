@@ -303,6 +303,16 @@ def in_parts(table: RunTable, names: Sequence[str]) -> Iterator[pd.DataFrame]:
         yield table[list(names)]
 
 
+def rows_where(table: RunTable, name: str, text: str) -> Any:
+    """Returns the rows of a table with a text in a column, which is read in parts.
+
+    Raises:
+        KeyError: There is no such column.
+    """
+    found = [(part[name] == text).to_numpy(dtype=np.bool_) for part in in_parts(table, [name])]
+    return table[np.concatenate(found)]
+
+
 def number_columns(table: RunTable, names: Sequence[str]) -> Floats:
     """Returns columns of numbers (n, len(names)); read one after the other, as in a table of their own they are twice.
 

@@ -5,9 +5,8 @@ An event is a full stop of a method, or a contact of its moving robot with the r
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -19,7 +18,7 @@ from hrcreplay.reporting.metrics.planning import is_moving, method_text, numeric
 from hrcreplay.reporting.metrics.series import MetricTable, durations_s, times
 from hrcreplay.settings.sections import setting
 from hrcreplay.store.run_folder import Run
-from hrcreplay.store.stored_table import RunTable, text_column
+from hrcreplay.store.stored_table import RunTable, in_parts, rows_where, text_column
 
 #: Source of the recorded person, as in contact.parquet, and in words.
 PERSONS = {
@@ -84,7 +83,7 @@ def add_contact(metrics: MetricTable, run: Run, slow_m_per_s: float) -> None:
         if prefix != RECORDED:
             _add_stops(metrics, prefix, motion, what, slow_m_per_s)
         if run.contact is not None:
-            rows = run.contact[run.contact["method"] == method]
+            rows = rows_where(run.contact, "method", method)
             _add_touch(metrics, prefix, rows, what)
             _add_nearest(metrics, prefix, rows, what)
             if prefix != RECORDED:
@@ -372,9 +371,11 @@ def _stops(motion: RunTable, t0_ns: int, slow: float) -> list[StopEvent]:
     moving = is_moving(motion, slow)
     braking = text_column(motion, "status") == "braking"
     speed, distance = (numeric_column(motion, name) for name in ("tcp_speed", "distance_m"))
-    stopping, names, moves = braking & moving, _names(motion), np.flatnonzero(moving)
+    stopping, moves = braking & moving, np.flatnonzero(moving)
+    stops = merged_runs(stopping, t_ns)
+    names = _names_at(motion, [first for first, _ in stops])
     found = []
-    for first, last in merged_runs(stopping, t_ns):
+    for (first, last), (link, limb, reason) in zip(stops, names, strict=True):
         goes_on = int(np.searchsorted(moves, last))
         again = int(moves[goes_on]) if goes_on < len(moves) else len(t_ns)
         found.append(
@@ -385,9 +386,9 @@ def _stops(motion: RunTable, t0_ns: int, slow: float) -> list[StopEvent]:
                 rest_s=float(lasts_s[last:again].sum()),
                 speed_m_per_s=float(speed[first]),
                 distance_m=float(distance[first]),
-                link=names["link"].at(first),
-                limb=names["limb"].at(first),
-                reason=names["reason"].at(first),
+                link=link,
+                limb=limb,
+                reason=reason,
             )
         )
     return found
@@ -396,10 +397,13 @@ def _stops(motion: RunTable, t0_ns: int, slow: float) -> list[StopEvent]:
 def _touches(contact: RunTable, t0_ns: int) -> list[StopEvent]:
     t_ns, lasts_s = times(contact), durations_s(times(contact))
     distance, speed = (numeric_column(contact, name) for name in ("distance_m", "contact_speed"))
-    touching, names = contact["moving"].to_numpy(dtype=bool) & (distance <= 0.0), _names(contact)
+    touching = contact["moving"].to_numpy(dtype=bool) & (distance <= 0.0)
+    runs = merged_runs(touching, t_ns)
+    nearest = [
+        first + int(np.nanargmin(np.where(touching[first:last], distance[first:last], np.inf))) for first, last in runs
+    ]
     found = []
-    for first, last in merged_runs(touching, t_ns):
-        at = first + int(np.nanargmin(np.where(touching[first:last], distance[first:last], np.inf)))
+    for (first, last), at, (link, limb, _) in zip(runs, nearest, _names_at(contact, nearest), strict=True):
         found.append(
             StopEvent(
                 kind="touch",
@@ -408,26 +412,23 @@ def _touches(contact: RunTable, t0_ns: int) -> list[StopEvent]:
                 rest_s=0.0,
                 speed_m_per_s=float(speed[first:last][touching[first:last]].max()),
                 distance_m=float(distance[at]),
-                link=names["link"].at(at),
-                limb=names["limb"].at(at),
+                link=link,
+                limb=limb,
                 reason="",
             )
         )
     return found
 
 
-@dataclass(frozen=True)
-class _NameColumn:
-    """The names in a column of a table, which may lack it."""
-
-    values: pd.Series[Any] | None
-
-    def at(self, row: int) -> str:
-        """The name in a row; empty where there is none."""
-        name = None if self.values is None else self.values.iloc[row]
-        return "" if pd.isna(name) else str(name)
-
-
-def _names(table: RunTable) -> Mapping[str, _NameColumn]:
-    """Returns the columns with names of link, limb and reason."""
-    return {name: _NameColumn(table[name] if name in table.columns else None) for name in ("link", "limb", "reason")}
+def _names_at(table: RunTable, rows: Sequence[int]) -> list[tuple[str, ...]]:
+    """Returns link, limb and reason in some rows; empty where there is none, or no such column."""
+    each = []
+    for name in ("link", "limb", "reason"):
+        found, first, last = [""] * len(rows), 0, 0
+        for part in in_parts(table, [name]) if name in table.columns else ():
+            first, last = last, last + len(part)
+            for k, row in enumerate(rows):
+                if first <= row < last and not pd.isna(value := part[name].iloc[row - first]):
+                    found[k] = str(value)
+        each.append(found)
+    return list(zip(*each, strict=True))

@@ -10,7 +10,7 @@ from hrcreplay.reporting.metrics.contact import method_prefixes
 from hrcreplay.reporting.metrics.planning import numeric_column
 from hrcreplay.reporting.metrics.series import MetricTable, times
 from hrcreplay.store.run_folder import Run
-from hrcreplay.store.stored_table import RunTable
+from hrcreplay.store.stored_table import RunTable, rows_where
 
 #: Name of the metric that counts them, where there are several.
 TRACKED = "people_tracked"
@@ -51,7 +51,7 @@ def add_people(metrics: MetricTable, run: Run) -> None:
         "bodies_seen_briefly", brief, "1", "bodies seen too briefly for that: they counted by their points alone"
     )
     prefixes, contact = method_prefixes(run), run.contact
-    by_method = {} if contact is None else {method: contact[contact["method"] == method] for method in prefixes}
+    by_method = {} if contact is None else {method: rows_where(contact, "method", method) for method in prefixes}
     for number in run.people:
         _add_times(metrics, number, run.state[run.state["person"] == number], run.state)
         for method, rows in by_method.items():

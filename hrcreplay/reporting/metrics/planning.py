@@ -18,7 +18,7 @@ from hrcreplay.geometry.polyline import advance_foot
 from hrcreplay.records import RECORDED, STATUSES, Bools, Floats, Ints
 from hrcreplay.reporting.metrics.series import MetricTable, durations_s, feet_in_turn, step_lengths, times, way_along
 from hrcreplay.robot.recorded import UNKNOWN
-from hrcreplay.store.stored_table import RunTable, number_columns, text_column
+from hrcreplay.store.stored_table import RunTable, number_columns, rows_where, text_column
 
 #: Shorter distances are rounding [m].
 _ROUNDING_M = 1e-9
@@ -220,7 +220,7 @@ def add_plan(
         _add_path(metrics, prefix, table, what)
         _add_progress(metrics, prefix, table, what, max_reference_lead_m)
         by = method if prefix == "plan" else prefix.removeprefix("baseline_")
-        rows = None if contact is None else contact[contact["method"] == by]
+        rows = None if contact is None else rows_where(contact, "method", by)
         _add_fastest(metrics, prefix, table, rows, what, near_m)
     for name, (value, unit, meaning) in PAPER.items():
         metrics.add(name, value, unit, meaning)
@@ -258,7 +258,7 @@ def _add_recorded(metrics: MetricTable, motion: RunTable, contact: RunTable | No
         reason="no separation is known: the person was not, or no joints are recorded, so the time of a stop is not",
     )
     _add_separation(metrics, RECORDED, motion, what, slow)
-    rows = None if contact is None else contact[contact["method"] == RECORDED]
+    rows = None if contact is None else rows_where(contact, "method", RECORDED)
     _add_fastest(metrics, RECORDED, motion, rows, what, near_m)
 
 
