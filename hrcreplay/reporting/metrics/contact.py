@@ -65,7 +65,7 @@ def add_contact(metrics: MetricTable, run: Run, slow_m_per_s: float) -> None:
         run: The run's tables.
         slow_m_per_s: A TCP slower than this counts as stationary if no joint turns [m/s].
     """
-    person = None if run.contact is None or not len(run.contact) else str(run.contact["person"].iloc[0])
+    person = None if run.contact is None or not len(run.contact) else str(run.contact.iloc[0]["person"])
     metrics.add(
         "contact_person",
         person,
