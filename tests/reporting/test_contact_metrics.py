@@ -8,12 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from hrcreplay.human.model import PARTS
 from hrcreplay.reporting import summary_text, verdict
+from hrcreplay.reporting.metrics.contact import _names_at
 from hrcreplay.reporting.summary_text import lines
+from hrcreplay.store import stored_table
 from hrcreplay.store.run_folder import Run
+from hrcreplay.store.stored_table import StoredTable
 from tests.facts import tells
 from tests.reporting.reading import page_lines, rendered
 from tests.reporting.synthetic import contact_run, contact_table, frame_of, make_run, metrics_of
@@ -286,3 +291,15 @@ def test_a_run_of_an_earlier_version_has_no_such_table(run: Run, tmp_path: Path)
     assert metrics_of(earlier)["contact_person"]["value"] is None
     assert verdict.verdict(earlier, metrics_of(earlier)) is None
     assert with_contact.table.title not in rendered(earlier, tmp_path)
+
+
+def test_names_in_some_rows_are_those_of_the_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Read in parts; rows in any order and twice; no name, and no such column."""
+    monkeypatch.setattr(stored_table, "_GROUPS", 2)
+    table = pd.DataFrame({"link": [f"link {k}" for k in range(90)], "limb": ["HD", None, ""] * 30})
+    pq.write_table(pa.Table.from_pandas(table, preserve_index=False), tmp_path / "table.parquet", row_group_size=10)
+    rows = [89, 0, 20, 19, 20, 40]
+    right = [(f"link {k}", "HD" if k % 3 == 0 else "", "") for k in rows]
+    for asked in (table, StoredTable(tmp_path / "table.parquet")):
+        assert _names_at(asked, rows) == right
+        assert _names_at(asked, []) == []

@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from hrcreplay.store import stored_table
-from hrcreplay.store.stored_table import RunTable, StoredTable, in_parts, number_columns, text_column
+from hrcreplay.store.stored_table import RunTable, StoredTable, in_parts, number_columns, rows_where, text_column
 
 N, GROUP = 1000, 64
 
@@ -249,3 +249,14 @@ def test_a_column_of_texts_has_each_text_once(tables: tuple[StoredTable, pd.Data
         found = text_column(table, "limb")
         assert found.tolist() == want
         assert len({id(text) for text in found}) == 3
+
+
+def test_the_rows_with_a_text_are_found_in_parts(tables: tuple[StoredTable, pd.DataFrame]) -> None:
+    stored, frame = tables
+    some = np.arange(N) % 7 < 3
+    for table, whole in ((stored, frame), (stored[some], frame[some]), (frame, frame)):
+        for text in ("HD", "THX", "nobody's"):
+            found = rows_where(table, "limb", text)
+            assert found["t_ns"].tolist() == whole.loc[whole["limb"] == text, "t_ns"].tolist()
+    with pytest.raises(KeyError, match="link"):
+        rows_where(stored, "link", "HD")
