@@ -121,7 +121,7 @@ def _make_replay(run_config: RunConfig, run: Run) -> ReplayPart | None:
 
 
 def _replay_there(run_config: RunConfig, folder: Path, meta: dict[str, Any]) -> ReplayPart | None:
-    """Does it in the second process."""
+    """Makes the replay in the second process."""
     made = _make_replay(run_config, _tables(folder, json.dumps(meta)))
     release_freed_memory()
     return made

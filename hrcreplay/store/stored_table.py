@@ -303,7 +303,7 @@ def in_parts(table: RunTable, names: Sequence[str]) -> Iterator[pd.DataFrame]:
         yield table[list(names)]
 
 
-def rows_where(table: RunTable, name: str, text: str) -> Any:
+def rows_where(table: RunTable, name: str, text: str) -> RunTable:
     """Returns the rows of a table with a text in a column, which is read in parts.
 
     Raises:
