@@ -184,6 +184,34 @@ def test_the_surface_is_closed_even_with_slivers() -> None:
         assert {(j, i) for i, j in edges} == set(edges)
 
 
+def is_closed(faces: Ints) -> bool:
+    """Each edge of the triangles once in either direction."""
+    ways = [(int(face[k]), int(face[(k + 1) % 3])) for face in faces for k in range(3)]
+    return len(set(ways)) == len(ways) and {(j, i) for i, j in ways} == set(ways)
+
+
+@pytest.mark.parametrize(("height", "volume"), [(-1.0, 6.0), (0.0, 6.0), (1.0, 4.0)])
+def test_a_box_is_cut_above_its_bottom_alone(height: float, volume: float) -> None:
+    corners, faces = above(*hull(BOX), height)
+    assert corners[:, 2].min() == max(height, 0.0)
+    assert is_closed(faces)
+    assert sphere_swept_volume_m3(corners, 0.0, faces) == pytest.approx(volume)
+
+
+def test_of_a_box_below_its_top_the_top_is_left() -> None:
+    corners, faces = above(*hull(BOX), 3.0)
+    assert sorted(map(tuple, corners.tolist())) == [(x, y, 3.0) for x in (0.0, 1.0) for y in (0.0, 2.0)]
+    assert sphere_swept_volume_m3(corners, 0.0, faces) == pytest.approx(0.0)
+
+
+def test_a_cut_through_corners_keeps_them() -> None:
+    octahedron = np.concatenate([np.eye(3), -np.eye(3)])
+    corners, faces = above(*hull(octahedron), 0.0)
+    assert len(corners) == 5
+    assert is_closed(faces)
+    assert sphere_swept_volume_m3(corners, 0.0, faces) == pytest.approx(2.0 / 3.0)
+
+
 def test_a_hull_above_a_height_holds_the_points_that_do_both() -> None:
     """Against qhull's own planes: a random point is in the part if it is in the hull and not below."""
     rng = np.random.default_rng(11)
@@ -202,9 +230,7 @@ def test_a_hull_above_a_height_holds_the_points_that_do_both() -> None:
         assert wanted.any()
         outward = np.cross(corners[faces[:, 1]] - corners[faces[:, 0]], corners[faces[:, 2]] - corners[faces[:, 0]])
         assert ((corners[faces[:, 0]] - corners.mean(axis=0)) * outward).sum(axis=1).min() > 0.0
-        ways = [(int(face[k]), int(face[(k + 1) % 3])) for face in faces for k in range(3)]
-        assert len(set(ways)) == len(ways)
-        assert {(j, i) for i, j in ways} == set(ways), "closed"
+        assert is_closed(faces)
         assert sphere_swept_volume_m3(corners, 0.0, faces) == pytest.approx(part.volume, rel=1e-12)
     corners, faces = above(vertices, triangles, 9.0)
     assert corners.shape == faces.shape == (0, 3)

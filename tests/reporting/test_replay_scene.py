@@ -153,19 +153,20 @@ def test_the_list_of_stops_has_each_once() -> None:
         reason=np.where(braking, "not certified", ""),
         tcp_speed=np.where(still, 0.0, 0.4),
         distance_m=0.3,
+        link=[f"link at {at_s:.2f} s" for at_s in t_s],
     )
     first, second = stop_events(motion, run.contact[run.contact["method"] == "qp"], T0_NS, 0.001)
-    assert (first.kind, first.reason, first.link, first.limb) == ("stop", "not certified", "tool", "LRA")
+    assert (first.kind, first.reason, first.link, first.limb) == ("stop", "not certified", "link at 2.00 s", "LRA")
     assert (first.at_s, first.moving_s, first.rest_s) == pytest.approx((2.0, 0.45, 0.6))
     assert (first.speed_m_per_s, first.distance_m) == pytest.approx((0.4, 0.3))
     assert (second.at_s, second.moving_s, second.rest_s) == pytest.approx((6.0, 0.1, 0.0))
     for_good = motion.assign(**{name: np.where(t_s >= 6.1, 0.0, motion[name]) for name in (*dq, "tcp_speed")})
     *_, last = stop_events(for_good, None, T0_NS, 0.001)
     assert (last.at_s, last.moving_s, last.rest_s) == pytest.approx((6.0, 0.1, t_s[-1] + 0.01 - 6.1))
-    (touch,) = stop_events(
-        motion.assign(status="tracking"), run.contact[run.contact["method"] == "scaling"], T0_NS, 0.001
-    )
-    assert touch.kind == "touch"
+    near = run.contact[run.contact["method"] == "scaling"]
+    near = near.assign(link=[f"{distance_m:.3f} m" for distance_m in near["distance_m"]])
+    (touch,) = stop_events(motion.assign(status="tracking"), near, T0_NS, 0.001)
+    assert (touch.kind, touch.link) == ("touch", f"{touch.distance_m:.3f} m"), "the link that came nearest"
     assert (touch.at_s, touch.moving_s) == pytest.approx((3.0, 0.5))
     assert (touch.speed_m_per_s, touch.distance_m) == pytest.approx((0.3, -0.02 - 0.01 * 0.49))
 
