@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -12,7 +13,7 @@ import pytest
 from hrcreplay.geometry.polygon import ConvexPolygon
 from hrcreplay.human.fusion.vacancy import WatchedArea
 from hrcreplay.limits import load_limits
-from hrcreplay.pipeline.batch.ticks import LEFT, MotionColumns
+from hrcreplay.pipeline.batch.ticks import LEFT, MotionColumns, run_blindly
 from hrcreplay.pipeline.planner import Planner
 from hrcreplay.pipeline.surroundings import Forecast, PredictionStage, Surroundings, WatchedBorder
 from hrcreplay.records import HumanStates, Motion, MotionRow
@@ -118,17 +119,20 @@ def assert_same(found: Motion, expected: Motion) -> None:
 def followed(
     one: Planner, around: Surroundings, people: HumanStates, names: tuple[str, ...], sizes: tuple[int, ...]
 ) -> tuple[Motion, int]:
-    """The motion in batches of so many ticks, and how many ticks Python took."""
+    """The motion in batches of so many ticks, and how many ticks Python took, or looked at people in."""
     by_hand, parts = 0, []
-    own = Planner._step
 
-    def counted(self: Planner, outlook: Forecast, tick: int, columns: MotionColumns) -> None:
-        nonlocal by_hand
-        by_hand += 1
-        own(self, outlook, tick, columns)
+    def counted(own: Callable[..., None]) -> Callable[..., None]:
+        def call(self: Planner, outlook: Forecast, tick: int, columns: MotionColumns) -> None:
+            nonlocal by_hand
+            by_hand += 1
+            own(self, outlook, tick, columns)
+
+        return call
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Planner, "_step", counted)
+        patch.setattr(Planner, "_step", counted(Planner._step))
+        patch.setattr(Planner, "_look", counted(Planner._look))
         _, first = people.ticks()
         begin = 0
         for size in sizes:
@@ -230,18 +234,49 @@ def test_printed_predictions_and_watched_areas_are_left_to_python(prediction: st
     ):
         assert Forecast(around, seen).ahead is None
         names = around.names_of(1)
-        expected = tick_by_tick(planner("scaling", {}), around, seen, names)
-        found, by_hand = followed(planner("scaling", {}), around, seen, names, (250, 650))
-        assert_same(found, expected)
-        assert by_hand == TICKS
+        for method in ("scaling", "none"):
+            expected = tick_by_tick(planner(method, {}), around, seen, names)
+            found, by_hand = followed(planner(method, {}), around, seen, names, (250, 650))
+            assert_same(found, expected)
+            assert by_hand == TICKS
 
 
-def test_a_robot_that_is_not_on_its_path_first_ends_the_stop_of_another_method() -> None:
+class _Hidden(Forecast):
+    """People at whom nobody may look."""
+
+    person = ahead = property(lambda _: pytest.fail("looked at people"))
+
+    def obstacles(self, tick: int, horizon_s: float) -> Obstacles:
+        pytest.fail(f"looked at people at tick {tick} until {horizon_s} s")
+
+
+def test_a_robot_that_ignores_people_moves_before_anybody_is_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    around, people = Surroundings(STAGE, FRESH_S), _with_every_kind(visitors())
+    names = around.names_of(3)
+    expected = tick_by_tick(planner("none", {}), around, people, names)
+    moved: list[dict[str, Any]] = []
+
+    def driven(scene: Any, moving: Any, found: MotionColumns, tick: int) -> Any:
+        done = run_blindly(scene, moving, found, tick)
+        moved.append({name: column.copy() for name, column in found._asdict().items()})
+        return done
+
+    monkeypatch.setattr("hrcreplay.pipeline.planner.run_blindly", driven)
+    hidden = _Hidden(around, people)
+    with pytest.raises(pytest.fail.Exception, match="looked at people"):
+        planner("none", {}).follow(hidden.t_ns, hidden, names)
+    (columns,) = moved
+    for name in set(MotionColumns._fields) - {"distance_m", "overlap_m", "limb", "link"}:
+        np.testing.assert_array_equal(columns[name], getattr(expected, name), name)
+
+
+@pytest.mark.parametrize("method", ["scaling", "none"])
+def test_a_robot_that_is_not_on_its_path_first_ends_the_stop_of_another_method(method: str) -> None:
     around, people = Surroundings(STAGE, FRESH_S), visitors()
     names = around.names_of(3)
     found = []
     for in_batches in (False, True):
-        one = planner("scaling", {})
+        one = planner(method, {})
         qp = planner("qp", {})
         forecast = Forecast(around, people)
         qp.follow(forecast.t_ns[:60], forecast, names)

@@ -462,12 +462,18 @@ def look(
         known: Whether all limbs are known.
         clearance_m: Clearance beyond limb radius + link radius [m].
     """
-    pose = pose_at(arm.chain, q, dq)
-    finite = math.isfinite(q.sum()) and math.isfinite(pose.J_tcp.sum() + pose.dJdq_tcp.sum())
+    pose, finite = finite_pose(arm, q, dq)
     if not (finite and known):
         none = np.empty((0, 0))
         return pose, finite, NearestLink(Separation(none, none), np.nan, -1, -1)
     return pose, finite, measure(pose.ends_m, arm.radius_m, vertices, offsets, radius, clearance_m)
+
+
+@njit(cache=True, inner=True)
+def finite_pose(arm: Arm, q: Floats, dq: Floats) -> tuple[RobotPose, bool]:
+    """Pose of the robot, and whether it is finite."""
+    pose = pose_at(arm.chain, q, dq)
+    return pose, math.isfinite(q.sum()) and math.isfinite(pose.J_tcp.sum() + pose.dJdq_tcp.sum())
 
 
 class Taken(NamedTuple):
