@@ -23,7 +23,7 @@ from hrcreplay.commands.notes import notes_of
 from hrcreplay.logs.reader import Log, open_log
 from hrcreplay.pipeline import assembly, reuse, stages
 from hrcreplay.pipeline.kernel_build import ensure_compiled
-from hrcreplay.pipeline.methods_elsewhere import MethodsElsewhere
+from hrcreplay.pipeline.methods_elsewhere import MethodsElsewhere, get_loaded
 from hrcreplay.pipeline.progress import NO_PROGRESS, Progress, ProgressBar, print_note
 from hrcreplay.pipeline.robot_mass import robot_mass
 from hrcreplay.pipeline.run_config import RunConfig, RunOptions, resolve
@@ -100,6 +100,10 @@ def execute(
         bar = held.enter_context(ProgressBar(f"reading {run_config.log.name}"))
         log = open_log(run_config.log, run_config.settings.logs)
         ticks_ns = stages.span_ticks(run_config, log)
+        two = processes > 1 and len(ticks_ns) >= MANY and "plan" in run_config.stages
+        second = held.enter_context(second_process()) if two else None
+        if second is not None:
+            second.submit(get_loaded)  # while this process prepares the work of both
         parts = reuse.dependencies(run_config, log, ticks_ns)
         reused = reuse.take_over(run_config, parts, writer, smooth=smooth)
         for stage in [stage for stage in run_config.stages if stage not in reused][-1:]:
@@ -107,8 +111,6 @@ def execute(
         seen = SeenBodies(writer.partial) if run_config.command == "report" and "fuse" not in reused else None
         sink = Sink(writer, Stopwatch(time.perf_counter_ns), bar.advance, seen=seen)
         compared = run_config.command == "report" and not log.header.has_truth  # this then includes the smoothed person
-        two = processes > 1 and len(ticks_ns) >= MANY and "plan" in run_config.stages
-        second = held.enter_context(second_process()) if two else None
         how: Any = {"folder": writer.partial, "smooth": smooth or compared, "second": second}
         told = run_stages(run_config, log, ticks_ns, chunk_ticks, sink, reused, **how)
         found = findings(run_config, told, reused)

@@ -88,6 +88,10 @@ class _Work:
         return {name: calls for name, calls in self._sink.watch.calls.items() if name != "predict"}
 
 
+def get_loaded() -> None:
+    """Does nothing: the process that is to do it has loaded this module, which takes it a second."""
+
+
 #: The work under way in this process, which is that of one run.
 _UNDER_WAY: list[_Work] = []
 
