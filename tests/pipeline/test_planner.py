@@ -16,12 +16,13 @@ from hrcreplay.limits import load_limits
 from hrcreplay.pipeline.batch.ticks import LEFT, MotionColumns, run_blindly
 from hrcreplay.pipeline.planner import Planner
 from hrcreplay.pipeline.surroundings import Forecast, PredictionStage, Surroundings, WatchedBorder
-from hrcreplay.records import HumanStates, Motion, MotionRow
+from hrcreplay.records import STATUSES, HumanStates, Motion, MotionRow
 from hrcreplay.robot.control.border import Border
 from hrcreplay.robot.control.control_step import (
     INSIDE,
     NO_HUMAN,
     NOT_CERTIFIED,
+    NOT_FINITE,
     REASONS,
     RETREATING,
     PlanSettings,
@@ -304,3 +305,22 @@ def test_a_robot_at_rest_stays_where_it_is_beside_somebody_unknown() -> None:
         assert set(motion.reason.tolist()) == {NO_HUMAN}
         assert np.isnan(motion.distance_m).all()
         assert set(motion.limb.tolist()) == set(motion.link.tolist()) == {-1}
+
+
+@pytest.mark.parametrize("method", ["qp", "scaling", "none"])
+def test_a_robot_without_finite_joints_stands_and_the_record_says_why(method: str) -> None:
+    around, people = Surroundings(STAGE, FRESH_S), visitors().rows(slice(0, 20))
+    names = around.names_of(3)
+    found = []
+    for in_batches in (False, True):
+        one = planner(method, {})
+        one.controller.take_over(at_rest(np.full(6, np.nan), np.array([0.0, 0.0])))
+        given = one, around, people, names
+        found.append(followed(*given, (20,))[0] if in_batches else tick_by_tick(*given))
+    for motion in found:
+        assert set(motion.reason.tolist()) == {NOT_FINITE}
+        assert np.isnan(motion.distance_m).all()
+        assert set(motion.limb.tolist()) == {-1}
+        assert set(motion.status.tolist()) == {STATUSES.index("braking")}
+    np.testing.assert_array_equal(found[1].programme_s, found[0].programme_s)
+    np.testing.assert_array_equal(found[1].q, found[0].q)
