@@ -89,7 +89,7 @@ class _Work:
 
 
 def get_loaded() -> None:
-    """Does nothing: the process that is to do it has loaded this module, which takes it a second."""
+    """Makes a process load this module, which takes a second: it is called there for nothing else."""
 
 
 #: The work under way in this process, which is that of one run.

@@ -1,7 +1,8 @@
 """A batch of ticks in one kernel: in each the people's volumes, the decision of a method, and the row of the motion.
 
 It gives the numbers of the stages in Python, bit by bit, at a quarter of their time: between two ticks nothing is
-converted. It ends before the first tick that a kernel does not decide alone, which Python then takes.
+converted. It ends before the first tick that a kernel does not decide alone, which Python then takes. A robot that
+ignores people goes through the whole batch before they are looked at.
 """
 
 from __future__ import annotations

@@ -87,7 +87,7 @@ def decide_on_path(
 
 @njit(cache=True, inner=True)
 def go_blindly(arm: Arm, grid: Grid, rules: TickRules, now: Stop) -> tuple[RobotPose, Taken]:
-    """The same of a robot that ignores people, and certifies nothing.
+    """The step along the path of a robot that ignores people; nothing certifies it.
 
     Args:
         arm: The manipulator.
