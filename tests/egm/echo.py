@@ -1,6 +1,8 @@
 """The least that keeps a session alive: the newest packet is answered with its own joints and speed zero.
 
-The measure for latency and missed cycles of a machine: ``python -m tests.egm.echo --port 6510 --duration 60``.
+The measure for latency and missed cycles of a machine: ``python -m tests.egm.echo --port 6510 --duration 60``. With
+``--work-us`` it also keeps a core as busy as a session does, by reading the clock after each answer. Between two reads
+nothing but the machine takes time, so a machine that stands is told from a program that is slow.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import struct
 import sys
 import time
 from contextlib import suppress
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,18 +24,29 @@ from hrcreplay.egm.codec import WRAP, BadPacket, Correction, decode_robot, encod
 _BUFFER = 65536
 
 
-def echo(server: socket.socket, duration_s: float) -> tuple[int, int]:
+#: A machine that lets a program wait for so long between two reads of the clock has stood.
+STOOD_NS = 1_000_000
+
+
+class Echoed(NamedTuple):
+    """What happened in the time of a loop."""
+
+    came: int  #: datagrams
+    answered: int  #: datagrams; one that another follows at once is not answered
+    stood_ns: list[int]  #: for how long the machine stood, each time
+
+
+def echo(server: socket.socket, duration_s: float, work_s: float = 0.0) -> Echoed:
     """Answers until the time is up.
 
     Args:
         server: A bound UDP socket, blocking; gets a time-out.
         duration_s: How long [s].
-
-    Returns:
-        Datagrams that came in, and those that were answered; one that another follows at once is not.
+        work_s: How long to read the clock after each answer [s].
     """
     still = np.zeros(6)
     came = seqno = 0
+    stood_ns: list[int] = []
     begun_ns = time.monotonic_ns()
     end_ns = begun_ns + round(duration_s * 1e9)
     server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("ll", 0, 100_000))
@@ -53,7 +67,21 @@ def echo(server: socket.socket, duration_s: float) -> tuple[int, int]:
         tm_ms = (now_ns - begun_ns) // 1_000_000 % WRAP
         server.sendto(encode_correction(Correction(seqno=seqno, tm_ms=tm_ms, q=q, dq=still)), peer)
         seqno += 1
-    return came, seqno
+        stood_ns += work(round(work_s * 1e9))
+    return Echoed(came, seqno, stood_ns)
+
+
+def work(for_ns: int) -> list[int]:
+    """Reads the clock for so long [ns]; the times for which the machine stood meanwhile [ns]."""
+    stood_ns = []
+    before_ns = time.monotonic_ns()
+    end_ns = before_ns + for_ns
+    while before_ns < end_ns:
+        now_ns = time.monotonic_ns()
+        if now_ns - before_ns > STOOD_NS:
+            stood_ns.append(now_ns - before_ns)
+        before_ns = now_ns
+    return stood_ns
 
 
 def main() -> None:
@@ -63,6 +91,7 @@ def main() -> None:
     parser.add_argument("--port", type=int, default=6510)
     parser.add_argument("--duration", type=float, default=60.0, help="seconds")
     parser.add_argument("--fifo", type=int, default=0, help="real-time priority, 1 to 99; 0: none")
+    parser.add_argument("--work-us", type=float, default=0.0, help="time to read the clock after each answer")
     arguments = parser.parse_args()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as server:
         server.bind((arguments.host, arguments.port))
@@ -70,8 +99,11 @@ def main() -> None:
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(arguments.fifo))
         gc.freeze()
         gc.disable()
-        came, answered = echo(server, arguments.duration)
-    sys.stdout.write(f"came {came}\nanswered {answered}\n")
+        found = echo(server, arguments.duration, 1e-6 * arguments.work_us)
+    longest_ms = 1e-6 * max(found.stood_ns, default=0)
+    sys.stdout.write(f"came {found.came}\nanswered {found.answered}\n")
+    if arguments.work_us:
+        sys.stdout.write(f"stood {len(found.stood_ns)} times for over 1 ms, at most {longest_ms:.1f} ms\n")
 
 
 if __name__ == "__main__":

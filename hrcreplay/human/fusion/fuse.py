@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from functools import cache
 
 import numpy as np
 
@@ -215,14 +216,20 @@ def written(
     return states, _count_events(track, cameras), trace
 
 
-def _count_events(track: Track, cameras: Sequence[str]) -> Counter[str]:
-    counts = Counter({"joints_reacquired": int(track.reacquired[0]), "ticks_saturated": int(track.saturated[0])})
-    for c, camera in enumerate(cameras):
-        counts[f"outlier_points_{camera}"] = int(track.outliers[c])
-        counts[f"superseded_frames_{camera}"] = int(track.superseded[c])
-    for c, k in np.argwhere(track.disbelieved).tolist():
-        counts[f"disbelieved_{POINTS[k]}_{cameras[c]}"] = int(track.disbelieved[c, k])
+def _count_events(track: Track, cameras: tuple[str, ...]) -> Counter[str]:
+    happened = (track.reacquired, track.saturated, track.outliers, track.superseded)
+    counts = Counter(dict(zip(_event_names(cameras), np.concatenate(happened).tolist(), strict=True)))
+    if track.disbelieved.any():
+        for c, k in np.argwhere(track.disbelieved).tolist():
+            counts[f"disbelieved_{POINTS[k]}_{cameras[c]}"] = int(track.disbelieved[c, k])
     return counts
+
+
+@cache
+def _event_names(cameras: tuple[str, ...]) -> tuple[str, ...]:
+    """Names of the events of which there is a count even if they never happen."""
+    of_cameras = (f"{event}_{camera}" for event in ("outlier_points", "superseded_frames") for camera in cameras)
+    return ("joints_reacquired", "ticks_saturated", *of_cameras)
 
 
 def process_noise(settings: Fusion, j: int, dt: float, damping: float) -> Floats:

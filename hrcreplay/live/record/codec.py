@@ -25,6 +25,7 @@ import json
 import struct
 from dataclasses import dataclass
 from enum import IntFlag
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -127,7 +128,7 @@ _LOOK = struct.Struct("<cqHHHHH")
 _VOLUMES = struct.Struct("<cqHHId")
 _ANSWER = struct.Struct("<cqqIIBBhhHB")
 _SILENCE = struct.Struct("<cqI")
-_DIGEST = 8
+_DIGEST, _NUMBER = 8, 8  # bytes
 _DIGESTS = 3  #: per limb: one of its bits, and one of its numbers on each of the two grids
 #: Cell width of both grids [m]. The second grid is shifted by half a cell, so a number near the border of a cell in one
 #: grid is near the middle of a cell in the other.
@@ -227,9 +228,9 @@ def decode_perception(message: bytes) -> RecordedPerception:
 
 def state_numbers(states: HumanStates) -> Floats:
     """(k, n) all numbers of each row of states, field after field."""
+    rows = len(states)
     found = [value for value in vars(states).values() if isinstance(value, np.ndarray)]
-    numbers = [value.reshape(len(states), -1) for value in found if value.dtype == np.float64]
-    return np.concatenate(numbers, axis=1)
+    return np.concatenate([value.reshape(rows, -1) for value in found if value.dtype == np.float64], axis=1)
 
 
 def volume_digests(volumes: SweptVolumes) -> tuple[bytes, ...]:
@@ -237,24 +238,22 @@ def volume_digests(volumes: SweptVolumes) -> tuple[bytes, ...]:
 
     If two volumes have the same hash on a grid, their coordinates differ by no more than the cell width of the grid.
     """
-    points, radius = np.ascontiguousarray(volumes.vertices_m, dtype=np.float64), volumes.radius_m.ravel()
-    grids = [
-        (np.floor(points / GRID_M + shift) + 0.0, np.floor(radius / GRID_M + shift) + 0.0)  # + 0.0 removes -0.0
-        for shift in (0.0, 0.5)
-    ]
+    points, radius = _hashed(volumes.vertices_m), _hashed(volumes.radius_m.ravel())
+    ends = [3 * _NUMBER * end for end in volumes.offsets.tolist()]
     return tuple(
         b"".join(
-            _hash(numbers[volumes.offsets[one] : volumes.offsets[one + 1]], radii[one : one + 1])
-            for numbers, radii in ((points, radius), *grids)
+            hashlib.blake2b(numbers[first:last] + radii[at : at + _NUMBER], digest_size=_DIGEST).digest()
+            for numbers, radii in zip(points, radius, strict=True)
         )
-        for one in range(len(radius))
+        for at, (first, last) in zip(range(0, len(radius[0]), _NUMBER), pairwise(ends), strict=True)
     )
 
 
-def _hash(points: Floats, radius: Floats) -> bytes:
-    found = hashlib.blake2b(points.data, digest_size=_DIGEST)
-    found.update(radius.tobytes())
-    return found.digest()
+def _hashed(numbers: Floats) -> list[bytes]:
+    """What is hashed of numbers: they themselves, and their cells on the two grids."""
+    cells = numbers / GRID_M
+    on_grids = np.floor([cells, cells + 0.5]) + 0.0  # + 0.0 removes -0.0
+    return [numbers.tobytes(), *(one.tobytes() for one in on_grids)]
 
 
 def same_on_a_grid(recorded: bytes, again: bytes) -> bool:
@@ -330,8 +329,11 @@ def encode_decision(found: Decision, signals: Signal, datagrams: int, took_us: i
     head = _ANSWER.pack(DECISION, *instants, signals, found.phase, *decided, datagrams, len(found.measured))
     if found.row is None:
         return head + found.reason.encode()
-    numbers = [found.measured, *(np.atleast_1d(getattr(found.row, name)) for name in _NUMBERS)]
-    return b"".join([head, np.concatenate(numbers).tobytes(), found.reason.encode()])
+    numbers = found.measured.tolist()
+    for name in _NUMBERS:
+        value = getattr(found.row, name)
+        numbers += value.tolist() if isinstance(value, np.ndarray) else [value]
+    return b"".join([head, np.array(numbers, np.float64).tobytes(), found.reason.encode()])
 
 
 def decode_decision(message: bytes) -> RecordedDecision:
