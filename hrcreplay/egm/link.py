@@ -382,7 +382,6 @@ class Received:
         sender: Address of the sender.
         t_ns: Monotonic clock right after the first of them was read.
         count: Number of these datagrams.
-        waited: True: they were in the queue before the call, so the caller is late.
     """
 
     data: bytes
@@ -390,7 +389,6 @@ class Received:
     sender: Address
     t_ns: int
     count: int
-    waited: bool
 
 
 #: Maximum number of other senders that are stored for reports.
@@ -446,18 +444,17 @@ class EgmServer:
     def newest(self) -> Received | None:
         """Waits for a datagram, then empties the queue; None if nothing arrives within the time-out."""
         deadline_ns = monotonic_ns() + self._timeout_ns
-        first = self._receive(socket.MSG_DONTWAIT)
-        waited = first is not None
-        while (left_ns := deadline_ns - monotonic_ns()) > 0:
-            first = first or self._take(left_ns)
-            if first is None:
-                return None
+        while (left_ns := deadline_ns - monotonic_ns()) > 0 and (first := self._take(left_ns)) is not None:
             t_ns = monotonic_ns()
-            received = self._choose([first, *self._drain()], t_ns, waited=waited)
+            received = self._choose([first, *self._drain()], t_ns)
             if received is not None:
                 return received
-            first, waited = None, False
         return None
+
+    def waiting(self) -> Received | None:
+        """Empties the queue without a wait; None if it has nothing of the robot."""
+        lot = self._drain()
+        return self._choose(lot, monotonic_ns()) if lot else None
 
     def answer(self, data: bytes, to: Address) -> None:
         """Sends an answer and ignores errors; a failure shows as silence of the robot."""
@@ -498,7 +495,7 @@ class EgmServer:
             except ConnectionError:
                 self.vanished += 1
 
-    def _choose(self, lot: list[tuple[bytes, Address]], t_ns: int, *, waited: bool) -> Received | None:
+    def _choose(self, lot: list[tuple[bytes, Address]], t_ns: int) -> Received | None:
         """Selects the datagrams of the robot of the session, or of the last caller without a session."""
         calls = [address for _, address in lot if address[0] == self.robot]
         if t_ns - self._heard_ns > self._silence_ns and self._peer not in calls:
@@ -509,7 +506,7 @@ class EgmServer:
         if not own or sender is None:
             return None
         self._peer, self._heard_ns = sender, t_ns
-        return Received(data=own[-1], older=tuple(own[:-1]), sender=sender, t_ns=t_ns, count=len(own), waited=waited)
+        return Received(data=own[-1], older=tuple(own[:-1]), sender=sender, t_ns=t_ns, count=len(own))
 
     def _count_strangers(self, senders: list[Address]) -> None:
         self.strangers += len(senders)

@@ -40,7 +40,6 @@ def test_a_datagram_comes_with_its_sender_and_its_instant(link: EgmServer) -> No
         received = link.newest()
         assert received is not None
         assert (received.data, received.older, received.count) == (b"one", (), 1)
-        assert received.waited
         assert received.sender == own.getsockname()
         assert before <= received.t_ns <= time.monotonic_ns()
         link.answer(b"told", received.sender)
@@ -61,6 +60,21 @@ def test_the_queue_is_emptied_and_kept(link: EgmServer) -> None:
         assert (received.data, received.older) == (b"next", ())
 
 
+def test_what_waits_is_taken_without_a_wait(link: EgmServer) -> None:
+    with robot(link) as own, robot(link) as stranger:
+        began = time.monotonic()
+        assert link.waiting() is None
+        own.send(b"one")
+        own.send(b"two")
+        received = link.waiting()
+        assert received is not None
+        assert (received.data, received.older, received.count) == (b"two", (b"one",), 2)
+        stranger.send(b"three")
+        assert link.waiting() is None
+        assert link.strangers == 1
+        assert time.monotonic() - began < LONG_S / 2
+
+
 def test_empty_and_long_datagrams_arrive_whole(link: EgmServer) -> None:
     with robot(link) as own:
         own.send(b"")
@@ -77,7 +91,6 @@ def test_it_wakes_as_soon_as_a_datagram_comes(link: EgmServer) -> None:
         began = time.monotonic()
         received = link.newest()
         assert received is not None
-        assert not received.waited
         assert time.monotonic() - began < LONG_S / 2
         later.join()
 

@@ -14,6 +14,7 @@ from hrcreplay.egm.robot_double.servo import PERIOD_NS
 from hrcreplay.egm.step_gate import StepGate
 from hrcreplay.live.control.loop import Loop, LoopSettings
 from hrcreplay.live.record.codec import Decision, Perception, TickEvent
+from hrcreplay.records import HumanStates
 from tests.live.flights import BEGIN_NS, FRAME_NS, RESPONSE_NS, Flight, far_away
 
 ROBOT: Address = ("192.0.2.1", 6510)
@@ -41,7 +42,6 @@ class Cable:
         """All that has come by now, or the next that comes within 20 ms."""
         deadline_ns = self._clock.t_ns + 20_000_000
         self._run(self._clock.t_ns)
-        waited = bool(self._coming) and self._coming[0][0] <= self._clock.t_ns
         while not self._coming or self._coming[0][0] > self._clock.t_ns:
             if self._clock.t_ns >= deadline_ns:
                 return None
@@ -50,7 +50,12 @@ class Cable:
         lot = []
         while self._coming and self._coming[0][0] <= self._clock.t_ns:
             lot.append(heapq.heappop(self._coming)[2])
-        return Received(lot[-1], tuple(lot[:-1]), ROBOT, self._clock.t_ns, len(lot), waited)
+        return Received(lot[-1], tuple(lot[:-1]), ROBOT, self._clock.t_ns, len(lot))
+
+    def waiting(self) -> Received | None:
+        """All that has come by now."""
+        self._run(self._clock.t_ns)
+        return self.newest() if self._coming and self._coming[0][0] <= self._clock.t_ns else None
 
     def _run(self, until_ns: int) -> None:
         while self._cycle_ns <= until_ns:
@@ -158,19 +163,23 @@ def counted(
     gate = StepGate(flight.robot.dq_max, flight.controller.setup.plan.dt_s)
     loop = CountedLoop(flight.controller, *parts, settings, gate, 0, clock.t_ns, clock=clock)  # type: ignore[arg-type]
     loop.work_ns, loop.look_ns = round(work_s * 1e9), round(look_s * 1e9)
-    answer, look = flight.controller.answer, flight.controller.update_perception
+    answer, fuse, predict = flight.controller.answer, flight.controller.fuse, flight.controller.predict
 
     def works(event: TickEvent) -> Decision:
         clock.t_ns += loop.work_ns
         loop.seen.append(answer(event))
         return loop.seen[-1]
 
-    def looks(t_ns: int, skeletons: Sequence[bytes]) -> Perception | None:
-        perception = look(t_ns, skeletons)
-        clock.t_ns += loop.look_ns
-        return perception
+    def fuses(t_ns: int, skeletons: Sequence[bytes]) -> HumanStates | None:
+        clock.t_ns += loop.look_ns // 2
+        return fuse(t_ns, skeletons)
+
+    def predicts(t_ns: int, states: HumanStates | None) -> Perception | None:
+        clock.t_ns += loop.look_ns // 2
+        return predict(t_ns, states)
 
     flight.controller.answer = works  # type: ignore[method-assign]
-    flight.controller.update_perception = looks  # type: ignore[method-assign]
+    flight.controller.fuse = fuses  # type: ignore[method-assign]
+    flight.controller.predict = predicts  # type: ignore[method-assign]
     loop.begin()
     return loop

@@ -36,7 +36,8 @@ from tests.live.sessions import children
 
 #: Where a bug may be; those of the stages the controller catches itself.
 PLACES: dict[str, tuple[Any, str]] = {
-    "fusion": (Observer, "update_perception"),
+    "fusion": (Observer, "fuse"),
+    "prediction": (Observer, "predict"),
     "controller": (QpController, "step"),
     "compiled tick": (controllers, "decide_held"),
     "packets": (session_controller, "decode_robot"),
@@ -50,6 +51,7 @@ PLACES: dict[str, tuple[Any, str]] = {
     "record of a look": (codec, "encode_perception"),
     "status": (status.StatusPublisher, "_status"),
     "link": (Cable, "newest"),
+    "link during a look": (Cable, "waiting"),
 }
 MOVING_S = 0.45
 
@@ -160,7 +162,7 @@ def test_garbage_is_not_answered_and_silence_ends_it() -> None:
     flight = Flight().fly(MOVING_S)
     loop = counted(flight)
     loop.sent, loop.sender = flight.answers[-1].datagram, ("192.0.2.1", 6510)
-    lot = [Received(b"\xff", (), loop.sender, 0, 1, False)]
+    lot = [Received(b"\xff", (), loop.sender, 0, 1)]
     told: list[bytes] = []
 
     class Silent:

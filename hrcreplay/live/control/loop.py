@@ -1,8 +1,8 @@
 """The control loop: receives a packet, answers it, updates the perception, and hands records to the other processes.
 
-The loop does not wait for other processes. If a perception update is not finished when the next packet arrives, the
-answer to this packet is late. The loop then skips the next update, so that the next answer is on time. The swept
-volumes are then one cycle older, which `live.reaction_s` allows for.
+The loop does not wait for other processes. A packet that arrives during a perception update is answered after the half
+of the update that is under way, so that even an update of nearly two cycles misses none. The swept volumes are then one
+cycle older, which `live.reaction_s` allows for.
 
 After a crash of the control process a fallback brakes the robot from the last reply until it is at rest. It does not
 use the controller, the stages, the protocol's state machine or the codec, because any of them may have failed. Its
@@ -107,7 +107,7 @@ class Loop:
     notes: list[str] = field(default_factory=list)
     reply_times: DurationHistogram = field(default_factory=DurationHistogram)
     answers: int = 0
-    skipped: int = 0  #: number of skipped perception updates
+    skipped: int = 0  #: number of answers during a perception update; their cycles have no update of their own
     robot: str | None = None
     last: Decision | None = None
     sent: bytes | None = None  #: the latest reply that was sent to the robot
@@ -118,7 +118,6 @@ class Loop:
     _bodies: list[bytes] = field(default_factory=list)
     _beat_ns: int = 0
     _late: bool = False
-    _skipped: bool = False
     _ended: bool = False
     _stored_ns: int = 0
     _low_disk: bool = False
@@ -149,13 +148,16 @@ class Loop:
             self.recorder.send(codec.encode_timeout(t_ns, signals))
         else:
             self._answer(received, signals)
-        self._skipped = received is not None and received.waited and not self._skipped
-        if self._skipped:
-            self.skipped += 1
-            self.controller.prepare()
-        else:
-            self._update_perception()
+        self._update_perception()
+        self.controller.prepare()
         return not self._over(signals)
+
+    def _answer_waiting(self) -> None:
+        """Answers a packet that has arrived during a perception update."""
+        received = self.pending = self.link.waiting()
+        if received is not None:
+            self.skipped += 1
+            self._answer(received, self._signals())
 
     def _answer(self, received: Received, signals: Signal) -> None:
         event = TickEvent(received.t_ns + self.anchor_ns, (*received.older, received.data), signals)
@@ -196,7 +198,10 @@ class Loop:
     def _update_perception(self) -> None:
         skeletons = self._receive_skeletons()
         t_ns = self.now_ns()
-        perception = self.controller.update_perception(t_ns, skeletons)
+        states = self.controller.fuse(t_ns, skeletons)
+        if states is not None:  # otherwise the next answer must stop the robot, so the failure is recorded first
+            self._answer_waiting()
+        perception = self.controller.predict(t_ns, states)
         for skeleton in skeletons:
             self.recorder.send(codec.encode_skeleton(t_ns, skeleton))
         self._tell_others(perception)
@@ -209,6 +214,7 @@ class Loop:
             self._stored_ns = t_ns
             self.stored = codec.encode_volumes(perception)
             self.recorder.send(self.stored)
+        self._answer_waiting()
 
     def _receive_skeletons(self) -> list[bytes]:
         skeletons = []

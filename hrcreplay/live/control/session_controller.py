@@ -21,7 +21,7 @@ from hrcreplay.live.control.stages import ControlSetup, MotionState, MotionStep,
 from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import Decision, Perception, Signal, TickEvent
 from hrcreplay.pipeline.stages import NS
-from hrcreplay.records import Floats, MotionRow
+from hrcreplay.records import Floats, HumanStates, MotionRow
 from hrcreplay.robot.control.control_step import RobotState, at_rest, motion_row
 from hrcreplay.robot.control.separation import Obstacles
 from hrcreplay.robot.control.static_obstacles import pair_too_near
@@ -158,9 +158,12 @@ class SessionController:
     watchdog has no stop reason. A stop reason is kept until the session ends or, with ``resume``, until it has been
     absent for ``resume_s``. A robot at rest always starts with an approach from its position, at approach speed.
 
-    The step of the next answer depends only on the last answer and the last perception update. Therefore it is
-    computed at the end of that update, and the answer only decides whether to use it. If a cycle has no time for an
-    update, ``prepare`` computes the step without one.
+    The step of the next answer depends only on the last answer and the last perception update. Therefore ``prepare``
+    computes it before the packet arrives, and the answer only decides whether to use it. Without it, the answer
+    computes the step itself.
+
+    An answer may come between the two halves of a perception update, ``fuse`` and ``predict``. It uses the volumes of
+    the update before, as if the new update had begun after it.
     """
 
     def __init__(self, setup: ControlSetup, observer: Observer, session: EgmSession) -> None:
@@ -209,19 +212,34 @@ class SessionController:
 
     def update_perception(self, t_ns: int, skeletons: Sequence[bytes]) -> Perception | None:
         """Updates stages 1 and 2 to ``t_ns`` [ns, session clock]; None if they failed, which stops the robot."""
-        self._ready, self._fresh, self._late = None, None, False
+        return self.predict(t_ns, self.fuse(t_ns, skeletons))
+
+    def fuse(self, t_ns: int, skeletons: Sequence[bytes]) -> HumanStates | None:
+        """First half of ``update_perception``; changes no answer unless it fails.
+
+        Returns:
+            The fused people; None if fusing them failed, which stops the robot.
+        """
         try:
-            self.perception = self.observer.update_perception(t_ns, skeletons, self._horizon_s())
-            self._fresh = _FreshPeople.of(self.perception, self.setup)
-            if self._motion is not None:
-                self._ready = _ReadyStep.of(self._motion, self._step(self._motion))
+            return self.observer.fuse(t_ns, skeletons)
         except Exception as error:  # on any error the robot still needs answers
             self.fault = self.fault or error
-            self.perception = self.perception if self.perception is not None and self.perception.t_ns == t_ns else None
+            return None
+
+    def predict(self, t_ns: int, states: HumanStates | None) -> Perception | None:
+        """Second half of ``update_perception``, for the result of ``fuse`` at the same instant."""
+        self.perception, self._ready, self._fresh, self._late = None, None, None, False
+        if states is None:
+            return None
+        try:
+            self.perception = self.observer.predict(t_ns, states, self._horizon_s())
+            self._fresh = _FreshPeople.of(self.perception, self.setup)
+        except Exception as error:  # on any error the robot still needs answers
+            self.fault = self.fault or error
         return self.perception
 
     def prepare(self) -> None:
-        """Computes the step of the next answer in advance from the last perception update; changes no answer."""
+        """Computes the step of the next answer in advance; changes no answer."""
         if self._motion is not None:
             with suppress(Exception):  # the answer fails in the same way and reports it
                 self._ready = _ReadyStep.of(self._motion, self._step(self._motion))

@@ -27,7 +27,7 @@ from hrcreplay.logs.skeleton_pb2 import Skeleton
 from hrcreplay.pipeline.fusion_stage import FusionStage
 from hrcreplay.pipeline.person_fuser import PersonFuser
 from hrcreplay.pipeline.surroundings import Surroundings
-from hrcreplay.records import CameraFrames, Floats, Ints, SweptVolumes
+from hrcreplay.records import CameraFrames, Floats, HumanStates, Ints, SweptVolumes
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.control_step import (
     PlanSettings,
@@ -61,19 +61,22 @@ class Observer:
         self._cleaner = Cleaner(cameras, gap_s, self.counts, nobody=fusion_stage.watched is not None)
         self.newest_ns: dict[str, int] = {}  #: per camera: last capture of a person, in the reference clock [ns]
 
-    def update_perception(self, t_ns: int, skeletons: Sequence[bytes], horizon_s: float) -> Perception:
-        """Fused people and swept volumes at ``t_ns``, which must be later than that of the previous update.
+    def fuse(self, t_ns: int, skeletons: Sequence[bytes]) -> HumanStates:
+        """Fused people at ``t_ns``, which must be later than that of the previous call.
 
         Args:
             t_ns: Session clock; it counts as the arrival of all skeletons of this update [ns].
             skeletons: Serialised Skeleton messages; unreadable ones are counted and left out.
-            horizon_s: Time from ``t_ns`` on for which the volumes must be valid, without the latency [s].
         """
         (states, events, _), seen = self._fuser.update(np.array([t_ns]), self._frames(t_ns, skeletons))
         self.counts.update(seen.counts)
         self.counts.update(events)
         for camera, capture_ns in zip(seen.measured.camera.tolist(), seen.measured.capture_ns.tolist(), strict=True):
             self.newest_ns[self._cameras[camera]] = capture_ns
+        return states
+
+    def predict(self, t_ns: int, states: HumanStates, horizon_s: float) -> Perception:
+        """Swept volumes of the people fused at ``t_ns`` [ns], valid for ``horizon_s`` without the latency [s]."""
         volumes = self._surroundings.prediction.volumes(states, horizon_s)
         return Perception(t_ns, states, volumes, _each(volumes, horizon_s), horizon_s)
 
