@@ -20,6 +20,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 import traceback
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -154,6 +155,10 @@ class ControlChannel:
         return data
 
 
+#: Time between two looks into the socket [s]. While the thread sleeps, control need not wake it with each message.
+_PAUSE_S = 0.005
+
+
 class Inbox:
     """Messages from control that are not written yet; a thread empties the socket even if the disk is slow."""
 
@@ -167,10 +172,20 @@ class Inbox:
         buffer = memoryview(bytearray(_LARGEST_RECORD))
         try:
             while size := self._control.recv_into(buffer):
-                self._waiting.append(bytes(buffer[:size]))
+                while size:
+                    self._waiting.append(bytes(buffer[:size]))
+                    size = self._at_once(buffer)
+                time.sleep(_PAUSE_S)
         except ConnectionResetError:
             pass  # control was killed
         self.ended.set()
+
+    def _at_once(self, buffer: memoryview) -> int:
+        """Size of the next message, which is then in the buffer; 0 if none has come yet, or if control has ended."""
+        try:
+            return self._control.recv_into(buffer, 0, socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            return 0
 
     def take(self) -> list[bytes]:
         """Messages that have arrived since the last call."""
