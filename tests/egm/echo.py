@@ -2,7 +2,8 @@
 
 The measure for latency and missed cycles of a machine: ``python -m tests.egm.echo --port 6510 --duration 60``. With
 ``--work-us`` it also keeps a core as busy as a session does, by reading the clock after each answer. Between two reads
-nothing but the machine takes time, so a machine that stands is told from a program that is slow.
+nothing but the machine takes time, so a machine that stands is told from a program that is slow. With ``--touch-mb`` it
+also writes to so much memory in turn; a session touches 16 MB.
 """
 
 from __future__ import annotations
@@ -14,15 +15,18 @@ import socket
 import struct
 import sys
 import time
+from collections.abc import Iterator
 from contextlib import suppress
+from itertools import cycle, islice
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hrcreplay.egm.codec import WRAP, BadPacket, Correction, decode_robot, encode_correction
 
 _BUFFER = 65536
-
+_PAGE, _BLOCK = 4096, 65536  # of memory
 
 #: A machine that lets a program wait for so long between two reads of the clock has stood.
 STOOD_NS = 1_000_000
@@ -36,15 +40,17 @@ class Echoed(NamedTuple):
     stood_ns: list[int]  #: for how long the machine stood, each time
 
 
-def echo(server: socket.socket, duration_s: float, work_s: float = 0.0) -> Echoed:
+def echo(server: socket.socket, duration_s: float, work_s: float = 0.0, touch_mb: int = 0) -> Echoed:
     """Answers until the time is up.
 
     Args:
         server: A bound UDP socket, blocking; gets a time-out.
         duration_s: How long [s].
         work_s: How long to read the clock after each answer [s].
+        touch_mb: How much memory to write to meanwhile [MiB].
     """
     still = np.zeros(6)
+    blocks = cycle(np.zeros((touch_mb << 20) // _BLOCK * _BLOCK, np.uint8).reshape(-1, _BLOCK)[:, ::_PAGE])
     came = seqno = 0
     stood_ns: list[int] = []
     begun_ns = time.monotonic_ns()
@@ -67,16 +73,22 @@ def echo(server: socket.socket, duration_s: float, work_s: float = 0.0) -> Echoe
         tm_ms = (now_ns - begun_ns) // 1_000_000 % WRAP
         server.sendto(encode_correction(Correction(seqno=seqno, tm_ms=tm_ms, q=q, dq=still)), peer)
         seqno += 1
-        stood_ns += work(round(work_s * 1e9))
+        stood_ns += work(round(work_s * 1e9), blocks)
     return Echoed(came, seqno, stood_ns)
 
 
-def work(for_ns: int) -> list[int]:
-    """Reads the clock for so long [ns]; the times for which the machine stood meanwhile [ns]."""
+def work(for_ns: int, blocks: Iterator[NDArray[np.uint8]]) -> list[int]:
+    """Reads the clock for so long [ns], and writes to a block of memory before each read.
+
+    Returns:
+        The times for which the machine stood meanwhile [ns].
+    """
     stood_ns = []
     before_ns = time.monotonic_ns()
     end_ns = before_ns + for_ns
     while before_ns < end_ns:
+        for block in islice(blocks, 1):
+            block += 1
         now_ns = time.monotonic_ns()
         if now_ns - before_ns > STOOD_NS:
             stood_ns.append(now_ns - before_ns)
@@ -92,6 +104,7 @@ def main() -> None:
     parser.add_argument("--duration", type=float, default=60.0, help="seconds")
     parser.add_argument("--fifo", type=int, default=0, help="real-time priority, 1 to 99; 0: none")
     parser.add_argument("--work-us", type=float, default=0.0, help="time to read the clock after each answer")
+    parser.add_argument("--touch-mb", type=int, default=0, help="memory to write to meanwhile")
     arguments = parser.parse_args()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as server:
         server.bind((arguments.host, arguments.port))
@@ -99,7 +112,7 @@ def main() -> None:
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(arguments.fifo))
         gc.freeze()
         gc.disable()
-        found = echo(server, arguments.duration, 1e-6 * arguments.work_us)
+        found = echo(server, arguments.duration, 1e-6 * arguments.work_us, arguments.touch_mb)
     longest_ms = 1e-6 * max(found.stood_ns, default=0)
     sys.stdout.write(f"came {found.came}\nanswered {found.answered}\n")
     if arguments.work_us:
