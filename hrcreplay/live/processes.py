@@ -13,7 +13,9 @@ A crash may also be a process that ended without an exception.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
+import resource
 import runpy
 import select
 import socket
@@ -222,6 +224,7 @@ class HelperProcess:
             _enlarge(end)
         near.setblocking(False)
         self._socket = near
+        self._buffer = memoryview(bytearray(_LARGEST))  # of its own: the system takes back a new one in a cycle, late
         self.alive = True
         self.dropped = 0  #: number of messages that were dropped
         self.last_words = ""  #: the reason for its end, if it has sent one
@@ -252,11 +255,12 @@ class HelperProcess:
         """Messages that have arrived since the last call."""
         for _ in range(_AT_ONCE):
             try:
-                message = self._socket.recv(_LARGEST)
+                size = self._socket.recv_into(self._buffer)
             except (BlockingIOError, InterruptedError):
                 return
             except OSError:
-                message = b""
+                size = 0
+            message = bytes(self._buffer[:size])
             if not message:
                 self.alive = False
                 return
@@ -300,8 +304,6 @@ def _enlarge(end: socket.socket) -> None:
 
 def raise_priority() -> list[str]:
     """Asks the system to run this process before others and to keep it in memory; returns what was refused."""
-    import ctypes
-
     refused = []
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(50))
@@ -309,8 +311,11 @@ def raise_priority() -> list[str]:
         refused.append("real-time priority")
     lock_current_and_future = 3
     try:
-        if ctypes.CDLL(None, use_errno=True).mlockall(lock_current_and_future):
+        library = ctypes.CDLL(None, use_errno=True)
+        if library.mlockall(lock_current_and_future):
             refused.append("locked memory")
+        else:
+            _keep_heap(library)
     except (OSError, AttributeError):
         refused.append("locked memory")
     return refused
@@ -318,12 +323,39 @@ def raise_priority() -> list[str]:
 
 def restore_priority() -> None:
     """Undoes ``raise_priority``."""
-    import ctypes
-
     with contextlib.suppress(OSError, AttributeError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).munlockall()
+        library = ctypes.CDLL(None)
+        library.munlockall()
+        library.mallopt(_TRIM_THRESHOLD, 128 << 10)
+        library.mallopt(_MMAP_MAX, 1 << 16)
+
+
+_TRIM_THRESHOLD, _MMAP_MAX = -1, -4  # of mallopt
+_SPARE = 16 << 20  #: free end of the heap, several times what a cycle needs [bytes]
+
+
+def _keep_heap(library: ctypes.CDLL) -> None:
+    """Gives the heap of the C library a free end and keeps it, so that no cycle has to wait for memory of the system.
+
+    The library returns the free end on its own, and because protobuf calls ``malloc_trim`` every 10,000 messages. It
+    does not do so if somebody else has moved the program's break behind it. Nothing happens in a library without
+    ``mallopt``.
+    """
+    if not hasattr(library, "mallopt"):
+        return
+    malloc, free, sbrk = library.malloc, library.free, library.sbrk
+    malloc.restype = sbrk.restype = ctypes.c_void_p
+    malloc.argtypes, free.argtypes, sbrk.argtypes = [ctypes.c_size_t], [ctypes.c_void_p], [ctypes.c_ssize_t]
+    library.mallopt(_MMAP_MAX, 0)  # large blocks come from the heap, too
+    library.mallopt(_TRIM_THRESHOLD, -1)
+    end, blocks = sbrk(0), list[int | None]()
+    while sbrk(0) == end and len(blocks) < 64:  # the first ones may fit between others
+        blocks.append(malloc(_SPARE))
+    for block in blocks:
+        free(block)
+    sbrk(resource.getpagesize())
 
 
 #: Exit code of a process that crashed; in sysexits.h it means an internal error.
