@@ -224,7 +224,7 @@ class HelperProcess:
             _enlarge(end)
         near.setblocking(False)
         self._socket = near
-        self._buffer = memoryview(bytearray(_LARGEST))  # of its own: the system takes back a new one in a cycle, late
+        self._buffer = memoryview(bytearray(_LARGEST))  # kept, since a new one for each message takes time
         self.alive = True
         self.dropped = 0  #: number of messages that were dropped
         self.last_words = ""  #: the reason for its end, if it has sent one
