@@ -12,10 +12,7 @@ A crash may also be a process that ended without an exception.
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
 import os
-import resource
 import runpy
 import select
 import socket
@@ -296,66 +293,10 @@ class HelperProcess:
 def _enlarge(end: socket.socket) -> None:
     """Sets the send buffer to the largest size that the system permits."""
     forced = getattr(socket, "SO_SNDBUFFORCE", 32)
-    with contextlib.suppress(OSError):
+    with suppress(OSError):
         end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
-    with contextlib.suppress(OSError):
+    with suppress(OSError):
         end.setsockopt(socket.SOL_SOCKET, forced, _BUFFER)
-
-
-def raise_priority() -> list[str]:
-    """Asks the system to run this process before others and to keep it in memory; returns what was refused."""
-    refused = []
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(50))
-    except (OSError, AttributeError):
-        refused.append("real-time priority")
-    lock_current_and_future = 3
-    try:
-        library = ctypes.CDLL(None, use_errno=True)
-        if library.mlockall(lock_current_and_future):
-            refused.append("locked memory")
-        else:
-            _keep_heap(library)
-    except (OSError, AttributeError):
-        refused.append("locked memory")
-    return refused
-
-
-def restore_priority() -> None:
-    """Undoes ``raise_priority``."""
-    with contextlib.suppress(OSError, AttributeError):
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-    with contextlib.suppress(OSError, AttributeError):
-        library = ctypes.CDLL(None)
-        library.munlockall()
-        library.mallopt(_TRIM_THRESHOLD, 128 << 10)
-        library.mallopt(_MMAP_MAX, 1 << 16)
-
-
-_TRIM_THRESHOLD, _MMAP_MAX = -1, -4  # of mallopt
-_SPARE = 16 << 20  #: free end of the heap, several times what a cycle needs [bytes]
-
-
-def _keep_heap(library: ctypes.CDLL) -> None:
-    """Gives the heap of the C library a free end and keeps it, so that no cycle has to wait for memory of the system.
-
-    The library returns the free end on its own, and because protobuf calls ``malloc_trim`` every 10,000 messages. It
-    does not do so if somebody else has moved the program's break behind it. Nothing happens in a library without
-    ``mallopt``.
-    """
-    if not hasattr(library, "mallopt"):
-        return
-    malloc, free, sbrk = library.malloc, library.free, library.sbrk
-    malloc.restype = sbrk.restype = ctypes.c_void_p
-    malloc.argtypes, free.argtypes, sbrk.argtypes = [ctypes.c_size_t], [ctypes.c_void_p], [ctypes.c_ssize_t]
-    library.mallopt(_MMAP_MAX, 0)  # large blocks come from the heap, too
-    library.mallopt(_TRIM_THRESHOLD, -1)
-    end, blocks = sbrk(0), list[int | None]()
-    while sbrk(0) == end and len(blocks) < 64:  # the first ones may fit between others
-        blocks.append(malloc(_SPARE))
-    for block in blocks:
-        free(block)
-    sbrk(resource.getpagesize())
 
 
 #: Exit code of a process that crashed; in sysexits.h it means an internal error.

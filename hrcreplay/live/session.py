@@ -30,7 +30,8 @@ from hrcreplay.live.control.session_controller import (
     reason_of_signals,
 )
 from hrcreplay.live.control.setup import build_controller, compile_kernels, live_run_config, start_table
-from hrcreplay.live.processes import HelperProcess, raise_priority, restore_priority
+from hrcreplay.live.priority import raise_priority, restore_priority
+from hrcreplay.live.processes import HelperProcess
 from hrcreplay.live.record import codec, folder
 from hrcreplay.live.record.codec import Signal
 from hrcreplay.live.record.recorder import free_bytes

@@ -17,7 +17,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import suppress
-from itertools import cycle, islice
+from itertools import cycle
 from typing import NamedTuple
 
 import numpy as np
@@ -87,7 +87,7 @@ def work(for_ns: int, blocks: Iterator[NDArray[np.uint8]]) -> list[int]:
     before_ns = time.monotonic_ns()
     end_ns = before_ns + for_ns
     while before_ns < end_ns:
-        for block in islice(blocks, 1):
+        if (block := next(blocks, None)) is not None:
             block += 1
         now_ns = time.monotonic_ns()
         if now_ns - before_ns > STOOD_NS:
