@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,6 +21,7 @@ from hrcreplay.live.record.recorder import SessionLogReader
 from hrcreplay.logs.reader import open_log
 from tests.facts import tells
 from tests.live import made
+from tests.live.human import PATIENCE_S
 
 
 @pytest.fixture(scope="module")
@@ -125,10 +127,12 @@ def recording(path: Path, before: Callable[[], None] | None = None, low_bytes: i
 
 def _on_disk(path: Path, number: int) -> list[bytes]:
     """The messages in a file that is being written, once there are so many."""
+    end_s = time.monotonic() + PATIENCE_S
     while True:
         found = list(SessionLogReader(path).messages()) if path.exists() and path.stat().st_size else []
         if len(found) >= number:
             return found
+        assert time.monotonic() < end_s, f"{len(found)} of {number} messages"
         select.select([], [], [], 0.02)
 
 
