@@ -39,15 +39,9 @@ from hrcreplay.reporting.tables import PageTable, neighbour_text, reason_text
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.active_constraints import TickContext, explain_refusal, propose_explained
 from hrcreplay.robot.control.certificate import NO_PLANES
-from hrcreplay.robot.control.control_step import (
-    REASONS,
-    Stop,
-    at_rest,
-    standstill_reason,
-    stop_axis_by_axis,
-    stop_straight,
-)
+from hrcreplay.robot.control.control_step import REASONS, standstill_reason
 from hrcreplay.robot.control.controllers import Controller, QpController
+from hrcreplay.robot.control.stops import Stop, at_rest, stop_axis_by_axis, stop_straight
 from hrcreplay.store.columns import motion_columns, read_states_at
 from hrcreplay.store.run_folder import arrow_table
 from hrcreplay.store.stored_table import RunTable, StoredTable, number_columns, text_column

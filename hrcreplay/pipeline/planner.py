@@ -20,7 +20,12 @@ from hrcreplay.pipeline.batch.ticks import (
 )
 from hrcreplay.pipeline.surroundings import Forecast
 from hrcreplay.records import RECORDED, Ints, Motion
-from hrcreplay.robot.control.control_step import REASONS, RobotState, nearest_of, observe
+from hrcreplay.robot.control.control_step import (
+    REASONS,
+    RobotState,
+    nearest_of,
+    observe,
+)
 from hrcreplay.robot.control.controllers import (
     BlindController,
     Controller,

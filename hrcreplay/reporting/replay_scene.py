@@ -21,8 +21,8 @@ from hrcreplay.reporting.metrics.planning import numeric_column
 from hrcreplay.reporting.metrics.series import columns, seconds_from, times
 from hrcreplay.reporting.robot_description import LinkFrame, link_frames, with_capsules
 from hrcreplay.robot import irb140, irb140_shape
-from hrcreplay.robot.control.control_step import stop_axis_by_axis
 from hrcreplay.robot.control.static_obstacles import StaticHull
+from hrcreplay.robot.control.stops import stop_axis_by_axis
 from hrcreplay.robot.irb140_shape import Solid
 from hrcreplay.robot.model import RobotModel, Segment
 from hrcreplay.settings.sections import setting

@@ -23,8 +23,9 @@ from hrcreplay.logs.reader import open_log
 from hrcreplay.pipeline import assembly, stages
 from hrcreplay.pipeline.run_config import resolve
 from hrcreplay.records import JOINTS, LENGTHS, LIMBS, STATUSES, Floats, SweptVolumes
-from hrcreplay.robot.control.control_step import RobotState, Stop, stop_along_path, stop_axis_by_axis, stop_straight
+from hrcreplay.robot.control.control_step import RobotState
 from hrcreplay.robot.control.separation import Obstacles, obstacles
+from hrcreplay.robot.control.stops import Stop, stop_along_path, stop_axis_by_axis, stop_straight
 from hrcreplay.robot.model import irb140
 from hrcreplay.robot.path import plan_programme
 from hrcreplay.robot.task import parse_task

@@ -25,9 +25,9 @@ from hrcreplay.live.control.stages import Observer
 from hrcreplay.live.record import codec, folder
 from hrcreplay.live.verify import SessionRecomputation
 from hrcreplay.live.view import status
-from hrcreplay.robot.control import control_step, controllers
-from hrcreplay.robot.control.control_step import stop_straight
+from hrcreplay.robot.control import controllers, stops
 from hrcreplay.robot.control.controllers import QpController
+from hrcreplay.robot.control.stops import stop_straight
 from tests.facts import facts, tells
 from tests.live.counted import Cable, CountedLoop, counted
 from tests.live.crashing import BUG, failing
@@ -130,12 +130,12 @@ def test_a_bug_is_one_line_and_a_traceback_in_the_folder(
 
 def test_the_place_of_a_bug_is_where_it_is_in_our_code() -> None:
     try:
-        control_step.at_rest({})  # type: ignore[arg-type]
+        stops.at_rest({})  # type: ignore[arg-type]
     except KeyError as error:
         said = processes.describe_exception(error)
-    lines = Path(control_step.__file__).read_text().splitlines()
+    lines = Path(stops.__file__).read_text().splitlines()
     number = next(i for i, line in enumerate(lines, 1) if "return Stop(q[None]" in line)
-    place = f"hrcreplay/robot/control/control_step.py:{number}, in at_rest"
+    place = f"hrcreplay/robot/control/stops.py:{number}, in at_rest"
     assert said == f"KeyError: None ({place})"
 
 

@@ -26,10 +26,10 @@ from hrcreplay.robot.control.control_step import (
     REASONS,
     RETREATING,
     PlanSettings,
-    at_rest,
 )
 from hrcreplay.robot.control.controllers import CONTROLLERS
 from hrcreplay.robot.control.separation import Obstacles, obstacles
+from hrcreplay.robot.control.stops import at_rest
 from hrcreplay.robot.model import RobotModel, irb140
 from hrcreplay.robot.path import plan_programme
 from hrcreplay.robot.task import parse_task

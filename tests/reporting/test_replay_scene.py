@@ -27,8 +27,8 @@ from hrcreplay.reporting.replay_scene import (
     shown_skeletons,
     volume_track,
 )
-from hrcreplay.robot.control.control_step import stop_axis_by_axis, stop_straight
 from hrcreplay.robot.control.static_obstacles import StaticHull
+from hrcreplay.robot.control.stops import stop_axis_by_axis, stop_straight
 from tests.reporting.moving import joints, moving_run, moving_scene, robot
 from tests.reporting.synthetic import LENGTHS_M, T0_NS, frame_of, pose
 

@@ -20,12 +20,12 @@ from hrcreplay.robot.control.control_step import (
     make_step,
     observe,
     standstill_reason,
-    stop_axis_by_axis,
 )
 from hrcreplay.robot.control.metric_rows import Problem
 from hrcreplay.robot.control.qp_controller import QpContext, Target, problem, propose
 from hrcreplay.robot.control.row_search import SLACK
 from hrcreplay.robot.control.separation import Obstacles, obstacles
+from hrcreplay.robot.control.stops import stop_axis_by_axis
 from hrcreplay.robot.kinematics import RobotPose
 from hrcreplay.robot.model import RobotModel, irb140
 from hrcreplay.settings.load import load_settings

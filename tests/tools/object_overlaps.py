@@ -23,9 +23,9 @@ from hrcreplay.pipeline import assembly, stages
 from hrcreplay.pipeline.run_config import RunConfig, resolve
 from hrcreplay.pipeline.surroundings import Forecast
 from hrcreplay.records import Floats, HumanStates
-from hrcreplay.robot.control.control_step import Stop
 from hrcreplay.robot.control.controllers import Controller
 from hrcreplay.robot.control.static_obstacles import StaticObstacles
+from hrcreplay.robot.control.stops import Stop
 from hrcreplay.settings.sections import Plan
 from hrcreplay.store.run_folder import Stopwatch
 from tests.robot import checker

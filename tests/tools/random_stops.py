@@ -19,9 +19,9 @@ import numpy as np
 from hrcreplay.kernels import njit
 from hrcreplay.records import LIMBS, Floats, SweptVolumes
 from hrcreplay.robot.control.certificate import NO_PLANES, clear
-from hrcreplay.robot.control.control_step import Stop, at_rest, stop_axis_by_axis, stop_straight
 from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.robot.control.static_obstacles import StaticHull, StaticObstacles, static_obstacles
+from hrcreplay.robot.control.stops import Stop, at_rest, stop_axis_by_axis, stop_straight
 from hrcreplay.robot.model import RobotModel, irb140
 
 DT_S, TOOL_M = 0.004, 0.10

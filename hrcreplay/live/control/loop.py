@@ -32,7 +32,8 @@ from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import Decision, Perception, Signal, TickEvent
 from hrcreplay.live.record.recorder import LOW
 from hrcreplay.records import MotionRow
-from hrcreplay.robot.control.control_step import BRAKING, Stop
+from hrcreplay.robot.control.control_step import BRAKING
+from hrcreplay.robot.control.stops import Stop
 
 _BIN_NS = 5_000
 _BINS = 20_000  # up to 0.1 s; the last bin counts all longer durations

@@ -22,9 +22,10 @@ from hrcreplay.live.record import codec
 from hrcreplay.live.record.codec import Decision, Perception, Signal, TickEvent
 from hrcreplay.pipeline.stages import NS
 from hrcreplay.records import Floats, HumanStates, MotionRow
-from hrcreplay.robot.control.control_step import RobotState, at_rest, motion_row
+from hrcreplay.robot.control.control_step import RobotState, motion_row
 from hrcreplay.robot.control.separation import Obstacles
 from hrcreplay.robot.control.static_obstacles import pair_too_near
+from hrcreplay.robot.control.stops import at_rest
 from hrcreplay.settings.sections import Live
 
 #: Reasons that end a session normally; every other reason ends it as a stop.

@@ -33,15 +33,13 @@ from hrcreplay.robot.control.control_step import (
     PlanSettings,
     RobotState,
     Step,
-    Stop,
     Taken,
     make_step,
-    stop_axis_by_axis,
-    stop_straight,
 )
 from hrcreplay.robot.control.controllers import Controller, Predict
 from hrcreplay.robot.control.separation import Obstacles, obstacles
 from hrcreplay.robot.control.static_obstacles import StaticObstacles
+from hrcreplay.robot.control.stops import Stop, stop_axis_by_axis, stop_straight
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.path import approach
 from hrcreplay.robot.task import Reference

@@ -34,8 +34,8 @@ from hrcreplay.logs import messages
 from hrcreplay.records import STATUSES, Bools, Floats, HumanStates, Ints, MotionRow, SweptVolumes, number_names
 
 if TYPE_CHECKING:  # recorder and screen do not need the robot's imports, which take 3/4 of their start-up time
-    from hrcreplay.robot.control.control_step import Stop
     from hrcreplay.robot.control.separation import Obstacles
+    from hrcreplay.robot.control.stops import Stop
 
 #: Phases of a session: the robot must not move yet, the first answers, the approach to the programme, the programme,
 #: braking for a stop reason, standing still for a stop reason.

@@ -15,7 +15,12 @@ from hrcreplay.geometry.vectors import norm_n
 from hrcreplay.human.prediction.sound_volumes import sweep_sound
 from hrcreplay.kernels import Held, njit
 from hrcreplay.records import Bools, Floats, Ints
-from hrcreplay.robot.control.control_step import Taken, TickRules, horizon_after, look
+from hrcreplay.robot.control.control_step import (
+    Taken,
+    TickRules,
+    horizon_after,
+    look,
+)
 from hrcreplay.robot.control.path_tick import decide_on_path, go_blindly
 from hrcreplay.robot.control.qp_tick import TickHulls, TickStart, decide_at_once
 from hrcreplay.robot.control.separation import NearestLink, boxes, gap_of

@@ -15,7 +15,7 @@ from scipy.optimize import linprog, nnls
 from hrcreplay.geometry.distances import distances, segment_distance
 from hrcreplay.records import Floats, Ints
 from hrcreplay.robot.control import qp_controller
-from hrcreplay.robot.control.control_step import PlanSettings, Proposal, Proposals, Stop
+from hrcreplay.robot.control.control_step import PlanSettings, Proposal, Proposals
 from hrcreplay.robot.control.controllers import (
     Controller,
     Observation,
@@ -31,6 +31,7 @@ from hrcreplay.robot.control.motion_check import MARGIN_M
 from hrcreplay.robot.control.row_search import SLACK
 from hrcreplay.robot.control.separation import Approach, Obstacles, rows_of_people
 from hrcreplay.robot.control.static_obstacles import StaticObstacles, plane_rows
+from hrcreplay.robot.control.stops import Stop
 from hrcreplay.robot.model import RobotModel
 
 #: A row is active if its link could approach faster by no more than this [m/s].

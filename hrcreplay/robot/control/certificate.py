@@ -39,9 +39,7 @@ from hrcreplay.robot.control.control_step import (
     RETREATING,
     PlanSettings,
     Proposal,
-    Stop,
     Taken,
-    at_rest,
 )
 from hrcreplay.robot.control.motion_check import (
     CLEAR,
@@ -62,6 +60,7 @@ from hrcreplay.robot.control.motion_check import (
 )
 from hrcreplay.robot.control.separation import Obstacles, no_obstacles
 from hrcreplay.robot.control.static_obstacles import StaticObstacles, StaticShapes, shapes_of
+from hrcreplay.robot.control.stops import Stop, at_rest
 from hrcreplay.robot.kinematics import Chain, ends_at
 from hrcreplay.robot.model import RobotModel
 

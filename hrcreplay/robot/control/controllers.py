@@ -25,8 +25,6 @@ from hrcreplay.robot.control.control_step import (
     RobotState,
     Sight,
     Step,
-    Stop,
-    at_rest,
     make_step,
     motion_row,
     observe,
@@ -36,6 +34,7 @@ from hrcreplay.robot.control.qp_controller import QpContext
 from hrcreplay.robot.control.qp_tick import BriefTick, TickHulls, TickStart, decide_held
 from hrcreplay.robot.control.separation import Obstacles
 from hrcreplay.robot.control.static_obstacles import StaticObstacles, shapes_of
+from hrcreplay.robot.control.stops import Stop, at_rest
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.task import Reference, ReferencePoint, follow, place
 

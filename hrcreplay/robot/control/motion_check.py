@@ -14,8 +14,8 @@ from hrcreplay.geometry.distances import Carriers, carriers, segment_distance, s
 from hrcreplay.geometry.vectors import dot3, norm_n
 from hrcreplay.kernels import njit
 from hrcreplay.records import Floats, Ints
-from hrcreplay.robot.control.control_step import Stop
 from hrcreplay.robot.control.static_obstacles import StaticShapes
+from hrcreplay.robot.control.stops import Stop
 from hrcreplay.robot.kinematics import Arm, Chain, ends_at, motion_of_links
 
 #: Rounding tolerance of the check that a link moves away [m^2/s].

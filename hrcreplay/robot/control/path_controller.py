@@ -19,7 +19,13 @@ from hrcreplay.kernels import njit
 from hrcreplay.records import Floats, Ints
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.contact_speed import largest_rate
-from hrcreplay.robot.control.control_step import PathRules, PlanSettings, Proposal, Proposals, Sight, Stop, stop_rows
+from hrcreplay.robot.control.control_step import (
+    PathRules,
+    PlanSettings,
+    Proposal,
+    Proposals,
+    Sight,
+)
 from hrcreplay.robot.control.qp_controller import cartesian_bounds
 from hrcreplay.robot.control.separation import (
     Approach,
@@ -31,6 +37,7 @@ from hrcreplay.robot.control.separation import (
     tick_rows,
     worst_rows,
 )
+from hrcreplay.robot.control.stops import Stop, stop_rows
 from hrcreplay.robot.kinematics import RobotPose
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.task import Grid, Reference, place

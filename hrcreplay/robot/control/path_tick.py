@@ -17,7 +17,6 @@ from hrcreplay.robot.control.control_step import (
     NOT_CERTIFIED,
     NOT_FINITE,
     TRACKING,
-    Stop,
     Taken,
     TickRules,
     finite_pose,
@@ -30,6 +29,7 @@ from hrcreplay.robot.control.path_controller import RateBounds, propose_rows
 from hrcreplay.robot.control.qp_tick import TickHulls, TickStart
 from hrcreplay.robot.control.separation import NearestLink, Separation
 from hrcreplay.robot.control.static_obstacles import StaticShapes
+from hrcreplay.robot.control.stops import Stop
 from hrcreplay.robot.kinematics import Arm, RobotPose
 from hrcreplay.robot.task import Grid
 

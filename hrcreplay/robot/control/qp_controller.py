@@ -28,9 +28,6 @@ from hrcreplay.robot.control.control_step import (
     QpRules,
     RobotState,
     Sight,
-    Stop,
-    axis_by_axis,
-    straight,
 )
 from hrcreplay.robot.control.metric_rows import Limits, Problem
 from hrcreplay.robot.control.minimiser import Solution, minimise
@@ -38,6 +35,7 @@ from hrcreplay.robot.control.motion_check import RETREAT_SPEED
 from hrcreplay.robot.control.row_search import SOLVED, search
 from hrcreplay.robot.control.separation import Obstacles, Separation, constraint_rhs, tick_rows
 from hrcreplay.robot.control.static_obstacles import StaticObstacles, StaticShapes, plane_rows, shapes_of
+from hrcreplay.robot.control.stops import Stop, axis_by_axis, straight
 from hrcreplay.robot.kinematics import Arm, RobotPose, axis_frames, tcp_jacobian
 from hrcreplay.robot.model import RobotModel
 

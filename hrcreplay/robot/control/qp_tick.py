@@ -18,7 +18,6 @@ from hrcreplay.robot.control.control_step import (
     NOT_CERTIFIED,
     RETREATING,
     TRACKING,
-    Stop,
     Taken,
     TickRules,
     go_on,
@@ -29,6 +28,7 @@ from hrcreplay.robot.control.motion_check import CLEAR, OPENING, RETREAT_SPEED, 
 from hrcreplay.robot.control.qp_controller import Instant, Stops, Target, propose_stops, static_ahead_s
 from hrcreplay.robot.control.separation import Gap, NearestLink, gap_of
 from hrcreplay.robot.control.static_obstacles import StaticShapes
+from hrcreplay.robot.control.stops import Stop
 from hrcreplay.robot.kinematics import Arm, RobotPose
 from hrcreplay.robot.task import Grid, ReferencePoint, follow
 

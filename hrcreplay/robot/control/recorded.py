@@ -13,13 +13,12 @@ from hrcreplay.robot.control.control_step import (
     REASONS,
     PlanSettings,
     RobotState,
-    Stop,
     nearest_of,
     observe,
-    stop_straight,
 )
 from hrcreplay.robot.control.separation import Obstacles
 from hrcreplay.robot.control.static_obstacles import StaticObstacles
+from hrcreplay.robot.control.stops import Stop, stop_straight
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.recorded import UNKNOWN, RecordedCapsules, RecordedJoints
 

@@ -11,9 +11,10 @@ from scipy.optimize import nnls
 from hrcreplay.records import Floats
 from hrcreplay.robot.control import certificate
 from hrcreplay.robot.control.certificate import NO_PLANES, clear, separating_normal
-from hrcreplay.robot.control.control_step import RobotState, Stop, at_rest, observe, stop_axis_by_axis, stop_straight
+from hrcreplay.robot.control.control_step import RobotState, observe
 from hrcreplay.robot.control.motion_check import CLEAR, OPEN, REFUSED, check
 from hrcreplay.robot.control.separation import rows_of_people, worst_rows
+from hrcreplay.robot.control.stops import Stop, at_rest, stop_axis_by_axis, stop_straight
 from hrcreplay.robot.model import RobotModel, irb140
 from tests.tools.random_stops import DT_S, TOOL_M, Box, as_obstacles, deepest_m, link_points, random_step, run
 

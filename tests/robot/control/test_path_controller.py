@@ -10,10 +10,11 @@ import pytest
 
 from hrcreplay.records import SweptVolumes
 from hrcreplay.robot.control import control_step
-from hrcreplay.robot.control.control_step import PlanSettings, Step, stop_along_path
+from hrcreplay.robot.control.control_step import PlanSettings, Step
 from hrcreplay.robot.control.controllers import ScalingController
 from hrcreplay.robot.control.path_controller import rates
 from hrcreplay.robot.control.separation import Obstacles, obstacles
+from hrcreplay.robot.control.stops import stop_along_path
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.path import plan_programme
 from hrcreplay.robot.task import Reference, parse_task

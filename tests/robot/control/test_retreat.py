@@ -8,9 +8,10 @@ import pytest
 from hrcreplay.records import STATUSES, Floats
 from hrcreplay.robot.control import control_step
 from hrcreplay.robot.control.certificate import NO_PLANES, clear
-from hrcreplay.robot.control.control_step import PlanSettings, Step, at_rest, stop_straight
+from hrcreplay.robot.control.control_step import PlanSettings, Step
 from hrcreplay.robot.control.controllers import QpController
 from hrcreplay.robot.control.motion_check import CLEAR, OPENING, REFUSED
+from hrcreplay.robot.control.stops import at_rest, stop_straight
 from hrcreplay.robot.model import RobotModel, irb140
 from hrcreplay.robot.path import plan_programme
 from hrcreplay.robot.task import parse_task

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from hrcreplay.records import Floats
-from hrcreplay.robot.control.control_step import PlanSettings, RobotState, observe, stop_axis_by_axis
+from hrcreplay.robot.control.control_step import PlanSettings, RobotState, observe
 from hrcreplay.robot.control.minimiser import Solution, minimise
 from hrcreplay.robot.control.qp_controller import QpContext, Target, propose
 from hrcreplay.robot.control.separation import Obstacles, obstacles
+from hrcreplay.robot.control.stops import stop_axis_by_axis
 from hrcreplay.robot.model import RobotModel
 from tests.robot.people import cloud, volumes
 from tests.robot.swinging import DT_S, HOME, SETTINGS, STOP_S, asked, dense, robot

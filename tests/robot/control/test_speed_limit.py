@@ -9,10 +9,17 @@ import pytest
 
 from hrcreplay.records import Floats
 from hrcreplay.robot.control.certificate import NO_PLANES, decide
-from hrcreplay.robot.control.control_step import BRAKING, PlanSettings, Proposal, RobotState, observe, stop_straight
+from hrcreplay.robot.control.control_step import (
+    BRAKING,
+    PlanSettings,
+    Proposal,
+    RobotState,
+    observe,
+)
 from hrcreplay.robot.control.minimiser import Solution, minimise
 from hrcreplay.robot.control.qp_controller import QpContext, Target, problem, propose
 from hrcreplay.robot.control.separation import obstacles
+from hrcreplay.robot.control.stops import stop_straight
 from hrcreplay.robot.model import RobotModel
 from hrcreplay.robot.path import approach, smooth_recorded
 from hrcreplay.robot.task import Reference, tcp_speed_cap, waits

@@ -12,7 +12,12 @@ from scipy.spatial import Delaunay
 from hrcreplay.records import Floats
 from hrcreplay.robot.control.active_constraints import explain_refusal, find_holding_rows, name_planes
 from hrcreplay.robot.control.certificate import NO_PLANES, clear
-from hrcreplay.robot.control.control_step import PlanSettings, Proposal, RobotState, at_rest, observe, stop_straight
+from hrcreplay.robot.control.control_step import (
+    PlanSettings,
+    Proposal,
+    RobotState,
+    observe,
+)
 from hrcreplay.robot.control.minimiser import Solution, minimise
 from hrcreplay.robot.control.motion_check import CLEAR, REFUSED
 from hrcreplay.robot.control.qp_controller import QpContext, Target, problem, static_ahead_s
@@ -28,6 +33,7 @@ from hrcreplay.robot.control.static_obstacles import (
     plane_rows,
     static_obstacles,
 )
+from hrcreplay.robot.control.stops import at_rest, stop_straight
 from hrcreplay.robot.model import RobotModel, irb140
 from hrcreplay.settings.load import load_settings
 from tests.robot.distances import axis_distance

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hrcreplay.records import Floats
-from hrcreplay.robot.control.control_step import Stop, at_rest, stop_along_path, stop_axis_by_axis, stop_straight
+from hrcreplay.robot.control.stops import Stop, at_rest, stop_along_path, stop_axis_by_axis, stop_straight
 from hrcreplay.robot.model import RobotModel, irb140
 from hrcreplay.robot.path import plan_programme
 from hrcreplay.robot.task import Reference, parse_task
